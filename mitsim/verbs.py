@@ -484,16 +484,30 @@ def design(
     >>> import mitsim as ms
     >>> ms.design("goal.toml", "design").headline  # doctest: +SKIP
     """
-    asked = DesignOptions(**options)
+    return prepare_design(goal, output, DesignOptions(**options))(job)
+
+
+def prepare_design(goal: Path | str | Goal, output: Path | str, asked: DesignOptions) -> Callable[[Job | None], Design]:
+    """Check a design before the renderer is imported, and return the function that runs it."""
     if asked.resume and asked.overwrite:
         raise ArgumentError("overwrite", "replaces the work that resume continues; give one of both")
     from mitsim.design.goal import Goal, load_goal
 
     checked = goal if isinstance(goal, Goal) else load_goal(goal)
-    Opening(camera=checked.camera).check(checked.scene, checked.families[0])
+    try:
+        own = (each if each.startswith("cyclic:") else read_name(each) for each in checked.patterns)
+        checked = checked.model_copy(update={"patterns": tuple(own)})
+        checked.check_count()
+        for patterns in checked.families:
+            Opening(camera=checked.camera).check(checked.scene, patterns)
+    except ArgumentError as error:  # of a field, not of an option
+        raise MitsimError(f"goal: {error}") from None
+    if checked.camera and load_sensor(locate(checked.camera, "calibration", ".toml", CAMERA)).mosaic:
+        problem = f"goal: camera {checked.camera}: has colour filters, and masks are searched for one line of light"
+        raise MitsimError(f"{problem}; give a camera without a mosaic, such as imx249")
     from mitsim.studies.mask_design import design as run_design  # only now: it takes seconds to import
 
-    return run_design(checked, output, job, asked.resume, asked.overwrite)
+    return partial(run_design, checked, output, resume=asked.resume, overwrite=asked.overwrite)
 
 
 class CompareOptions(Styled):

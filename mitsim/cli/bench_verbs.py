@@ -208,10 +208,10 @@ class Designing(DesignOptions, Common):
 
 @command
 def design(asked: Designing) -> int:
-    """Search the mask with the least expected error, and prove it by rendered images.
+    """Search the mask with the least error, and prove it by images.
 
-    Simple masks (random, pinholes, maximum length sequence) stand beside it with as many tries. `mitsim design predict`
-    is `mitsim predict`.
+    Its camera and those of the best simple masks (random, pinholes, maximum length sequence) are captured, calibrated
+    and reconstructed. `mitsim design predict` is `mitsim predict`.
 
     $ mitsim new goal mine
     $ mitsim design mine.toml -o design

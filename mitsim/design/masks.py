@@ -7,18 +7,21 @@ import math
 import re
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import tomli_w
+from pydantic import Field
 from scipy.optimize import brentq
 
 from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.layout import before_board
 from mitsim.calibrate.board_session import Session
 from mitsim.core.arrays import FloatArray
+from mitsim.core.configuration import Configuration, validate
+from mitsim.core.errors import MitsimError
 from mitsim.core.files import read_json, write_json, write_text
 from mitsim.core.images import write_numbers
 from mitsim.core.job import Job
@@ -28,8 +31,10 @@ from mitsim.design.goal import Goal
 from mitsim.design.objective import CodedSide, Light, Objective, Prior, cyclic_patterns
 from mitsim.design.predict import Stand, TracedLight
 from mitsim.design.search import Found, Search
-from mitsim.devices.patterns import PatternFamily
+from mitsim.devices.camera import CameraGeometry
+from mitsim.devices.patterns import PatternFamily, short_name
 from mitsim.devices.session import load_recipe
+from mitsim.optics.diffraction import narrowest_mm
 from mitsim.optics.shadow import Directions
 
 STATE, PATTERNS, FOR_DOTS = "search.json", "patterns.toml", "mask for dots"
@@ -54,11 +59,12 @@ class Choice:
     @property
     def shown(self) -> str:
         """Name of the patterns, with the code of cyclic ones."""
-        return f"{self.patterns} {self.lit}".strip()
+        return f"{short_name(self.patterns)} {self.lit}".strip()
 
     @property
     def words(self) -> str:
-        return f"features of {self.feature_mm * 1e3:g} um, {self.distance_mm:g} mm from the sensor, {self.shown}"
+        place = f"features of {self.feature_mm * 1e3:g} um, {self.distance_mm:g} mm from the sensor"
+        return f"{place}, {self.shown}"
 
     def family(self, bench: Apparatus) -> PatternFamily:
         if not self.lit:
@@ -76,12 +82,12 @@ class Candidate:
     found: Found
     exposure_total_s: float
     predicted: float = math.nan
-    causes: Mapping[str, float] | None = None
+    causes: Mapping[str, float] = field(default_factory=dict)
     rendered: float = math.nan
     scatter: float = math.nan
     session_s: float = math.nan
     warnings: tuple[str, ...] = ()
-    image: FloatArray | None = None
+    image: FloatArray = field(default_factory=lambda: np.zeros((1, 1)))
 
     def payload(self) -> dict[str, Any]:
         return {
@@ -106,11 +112,24 @@ class Candidate:
 # -------- Search
 
 
+def _camera(bench: Apparatus, **update: Any) -> CameraGeometry:
+    """Return the camera of a bench with a thin separable mask in place of its own."""
+    bare = {"mask": "separable", "mask_plate": None, "mask_thickness": 0.0, **update}
+    return validate(CameraGeometry, {**dict(bench.geometry), **bare}, "goal")
+
+
 def stand_of(bench: Apparatus, seed: int) -> tuple[Stand, float]:
-    """Trace the light of a scene and of its white board, and return them with the session's exposure time [s]."""
-    recipe = load_recipe().of_one_depth()
+    """Trace the light of a scene and of its white board, and return them with the session's exposure time [s].
+
+    The bench, which may have any mask, gets a thin separable one.
+    """
+    bench.loaded.camera.wear(_camera(bench))
+    bench, recipe = replace(bench, devices=replace(bench.devices, camera=_camera(bench))), load_recipe().of_one_depth()
     board = TracedLight.of(before_board(bench, recipe.board_reflectance), seed)
     stand = Stand(bench, TracedLight.of(bench, seed), board)
+    if not (stand.unit > 0 and stand.truth.any()):
+        problem = f"scene {bench.loaded.path}: no light of the projector comes from it to the camera"
+        raise MitsimError(f"{problem}, so that no mask is better than another; give another scene")
     return stand, stand.session_noise(Session(bench, recipe, seed))[1]
 
 
@@ -119,16 +138,25 @@ def objectives(stand: Stand, goal: Goal, choice: Choice, session_s: float) -> li
     """Return the objectives of a ``choice``, one for each dose and distance."""
     bench, sensor = stand.bench, stand.bench.sensor
     family, prior = choice.family(bench), prior_of(stand, goal)
+    if family.signed:
+        problem = f"patterns: got {choice.patterns!r}, which are differences of two frames, and a search knows single"
+        raise MitsimError(f"goal: {problem} ones; give uniform, dots:K, random:K or own patterns")
+    shown = family.left.astype(np.float64), family.right.astype(np.float64)
+    if all(size * side.shape[1] <= bench.n for size, side in zip(bench.geometry.frame_shape, shown, strict=True)):
+        problem = f"patterns: got {short_name(choice.patterns)!r}, too few data for a solver to estimate their noise"
+        raise MitsimError(f"goal: {problem} from so few pixels; give more patterns, or another camera")
+    narrowest = narrowest_mm(float(bench.spectrum.wavelengths_nm.max()))
+    if choice.feature_mm < narrowest:
+        problem = f"feature_um: got {choice.feature_mm * 1e3:g}, too narrow for the model of diffraction"
+        raise MitsimError(f"goal: {problem}; give at least {narrowest * 1e3:.3g}")
+    depths, found = goal.scene_distances_mm or (bench.geometry.scene_distance,), list[Objective]()
     update: dict[str, Any] = {"mask_feature": choice.feature_mm, "mask_distance": choice.distance_mm}
-    update |= {"mask": "separable", "mask_plate": None}
-    depths = goal.scene_distances_mm or (bench.geometry.scene_distance,)
-    camera, found = bench.geometry.model_copy(update=update), list[Objective]()
+    camera = _camera(bench, **update, scene_distance=min(depths))
     seen = camera.half_width + choice.distance_mm * (camera.tan_half_fov + camera.half_width / min(depths))
     features = 2 * (math.ceil(seen / choice.feature_mm) + _EDGE_FEATURES) + 1
     for depth in depths:
-        camera = camera.model_copy(update={"scene_distance": depth})
+        camera = _camera(bench, **update, scene_distance=depth)
         directions = [Directions.cells(np.linspace(*window, bench.n + 1)) for window in bench.windows_at(depth)]
-        shown = family.left.astype(np.float64), family.right.astype(np.float64)
         rows = CodedSide(camera, 0, directions[0], features, shown[0], bench.waves)
         near = np.allclose(directions[0].centres, directions[1].centres, rtol=0, atol=_ALIKE * directions[0].width)
         alike = camera.axes_alike and near and np.array_equal(shown[0], shown[1])
@@ -166,28 +194,51 @@ def search_of(stand: Stand, goal: Goal, choice: Choice, session_s: float) -> Sea
     return Search(objectives(stand, goal, choice, session_s), goal.open_part, goal.judge == "worst", goal.seed)
 
 
-def run_search(stand: Stand, goal: Goal, folder: Path, job: Job, session_s: float) -> tuple[list[Candidate], bool]:
-    """Return the best masks: the found one, then simple ones; and whether all starts were made.
+class _Start(Configuration):
+    """A start that is done, and its result."""
+
+    origin: str
+    code: str = Field(pattern="^[01]+$")
+    evaluations: int = Field(ge=0)
+
+
+class _State(Configuration):
+    """Content of ``search.json``: starts that are done, by choice."""
+
+    starts: dict[str, list[_Start]] = Field(default_factory=dict)
+
+
+def searches(stand: Stand, goal: Goal, session_s: float) -> dict[Choice, Search]:
+    """Return each choice of feature size, distance and family with its search."""
+    distances = goal.mask_distance_mm or (stand.bench.geometry.mask_distance,)
+    options = itertools.product(goal.feature_um, distances, goal.families)
+    order = [Choice(feature * 1e-3, distance, patterns) for feature, distance, patterns in options]
+    return {choice: search_of(stand, goal, choice, session_s) for choice in order}
+
+
+def run_search(
+    stand: Stand, goal: Goal, folder: Path, job: Job, session_s: float, every: dict[Choice, Search]
+) -> tuple[list[Candidate], bool]:
+    """Return the best masks: the found one, then simple ones; and whether all starts were made; add to ``every``.
 
     Starts that are done are in ``search.json``, from which a search that was stopped goes on. For cyclic patterns,
     masks for dots are searched first. Masks for the code that is best with the best of them follow, until codes repeat.
     """
     path = folder / STATE
-    done: dict[str, Any] = read_json(path) if path.is_file() else {}
+    done = validate(_State, read_json(path), f"file {path}").starts if path.is_file() else {}
     began, best, complete = time.monotonic(), dict[str, tuple[Choice, Found, Search]](), True
 
     def keep(name: str, choice: Choice, found: Found | None, search: Search) -> None:
         if found is not None and (name not in best or found.score < best[name][1].score):
             best[name] = choice, found, search
 
-    distances = goal.mask_distance_mm or (stand.bench.geometry.mask_distance,)
-    options = itertools.product(goal.feature_um, distances, goal.families)
-    order = [Choice(feature * 1e-3, distance, patterns) for feature, distance, patterns in options]
-    every = {choice: search_of(stand, goal, choice, session_s) for choice in order}
+    order = list(every)
     known_masks = dict[Choice, list[tuple[str, FloatArray]]]()
     for number, choice in enumerate(order):  # to which cyclic patterns are added
         search, masks, spent = every[choice], list[Found](), 0
-        own: list[dict[str, Any]] = done.setdefault(choice.words, [])
+        own = done.setdefault(repr(astuple(choice)), [])
+        if any(len(each.code) != search.features for each in own):
+            raise MitsimError(f"file {path}: has codes of other lengths; remove it, and the search begins again")
         starts = itertools.chain(known_masks.get(choice, ()), search.starts())
         for index, (origin, start) in enumerate(itertools.islice(starts, goal.starts)):
             if index == len(own):
@@ -195,11 +246,11 @@ def run_search(stand: Stand, goal: Goal, folder: Path, job: Job, session_s: floa
                     complete = False
                     break
                 found = search.improve(origin, start, goal.evaluations)
-                own.append({"origin": origin, "code": _text(found.code), "evaluations": found.evaluations})
-                write_json(path, done)
+                own.append(_Start(origin=found.origin, code=_text(found.code), evaluations=found.evaluations))
+                write_json(path, _State(starts=done).model_dump())
             known = own[index]
-            code = _code(known["code"])
-            found = Found(known["origin"], code, search.score(code).score, known["evaluations"])
+            code = np.array([float(each) for each in known.code])
+            found = Found(known.origin, code, search.score(code).score, known.evaluations)
             spent += found.evaluations
             masks.append(found)
             keep("design", choice, found, search)
@@ -223,18 +274,14 @@ def run_search(stand: Stand, goal: Goal, folder: Path, job: Job, session_s: floa
         del best[FOR_DOTS]
     candidates = []
     for name, (choice, found, search) in best.items():
-        seconds = search.objectives[0].frame_s((found.code, found.code)) / goal.doses[0]
-        frames = len(choice.family(stand.bench).shots)
-        candidates.append(Candidate(name, choice, found, frames * seconds))
+        objective = search.objectives[0]
+        longer = objective.frame_s((found.code, found.code)) / objective.light.frame_s
+        candidates.append(Candidate(name, choice, found, goal.exposure_total_s * longer))
     return candidates, complete
 
 
 def _text(code: FloatArray) -> str:
     return "".join(str(int(each)) for each in code)
-
-
-def _code(text: str) -> FloatArray:
-    return np.array([float(each) for each in text])
 
 
 # -------- Files to make a mask with
@@ -280,24 +327,24 @@ def sensitivity(search: Search, code: FloatArray) -> dict[str, float]:
         places = random.choice(search.used, max(round(len(search.used) / 100), 1), replace=False)
         made[places] = 1 - made[places]
         worse.append(search.score(made).score)
-    dim = [replace(each, light=replace(each.light, frame_s=each.light.frame_s / 10)) for each in search.objectives]
-    dark = Search(dim, search.open_part, search.worst, search.seed).score(code).score
-    return {
-        "one feature in a hundred wrong": -10 * math.log10(float(np.mean(worse)) / here),
-        "a tenth of the light": -10 * math.log10(dark / here),
-    }
+    flaws, dark = float(np.mean(worse)) / here, _score(search, code, 0.1) / here
+    losses = {"one feature in a hundred wrong": flaws, "a tenth of the light": dark}
+    return {name: -10 * math.log10(loss) for name, loss in losses.items()}
+
+
+def _score(search: Search, code: FloatArray, longer: float) -> float:
+    """Return the score of a code for exposures that are ``longer`` by a factor."""
+    changed = [
+        replace(each, light=replace(each.light, frame_s=each.light.frame_s * longer)) for each in search.objectives
+    ]
+    return Search(changed, search.open_part, search.worst, search.seed).score(code).score
 
 
 def seconds_for(search: Search, code: FloatArray, goal: Goal) -> float | None:
     """Return the seconds of all frames after which the wanted PSNR is expected; None if no exposure reaches it."""
-    assert goal.wanted_psnr_db is not None
 
     def short(log: float) -> float:
-        objectives = [
-            replace(each, light=replace(each.light, frame_s=each.light.frame_s * 10**log)) for each in search.objectives
-        ]
-        score = Search(objectives, search.open_part, search.worst, search.seed).score(code).score
-        return -10 * math.log10(score) - float(goal.wanted_psnr_db or 0)
+        return -10 * math.log10(_score(search, code, 10**log)) - float(goal.wanted_psnr_db or 0)
 
     if short(-6.0) > 0 or short(4.0) < 0:
         return None

@@ -21,6 +21,7 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from mitsim.core.arrays import FloatArray
+from mitsim.core.errors import MitsimError
 from mitsim.design.expected import Cause, expected_error
 from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.projector import Spectrum
@@ -28,6 +29,8 @@ from mitsim.optics.diffraction import ComplexArray, edge_wave
 from mitsim.optics.shadow import Directions, ShadowGeometry, trapezoid_weights
 
 _MOMENT = 1 / 60
+_MOST = 1 << 26
+"""Features times grid cells of a side; a GiB."""
 _CELLS = 16
 """Grid cells in sqrt(lambda D)."""
 _BRIGHT = 0.5
@@ -91,6 +94,7 @@ class CodedSide:
         loss = (1 + squared) ** -2.0 * camera.angular_response(squared) * camera.pixel_fill_factor
         own, seen = shadow.from_mask(directions, axis)
         reach = float(np.abs(own.crossings(seen)).max()) + own.half_pixel + 2 * own.half_cell(seen)
+        _check_size(camera, features, features)
         lines = (np.arange(features + 1) - features / 2) * camera.mask_feature
         self._waves = list[tuple[float, ComplexArray]]()
         cell, count = camera.mask_feature, features
@@ -98,6 +102,7 @@ class CodedSide:
             products = spectrum.wavelengths_nm * 1e-6 * shadow.distance_mm * shadow.shrink
             cell = float(products.min() ** 0.5 / _CELLS)
             count = 2 * int(np.ceil(reach / cell))
+            _check_size(camera, features, count * len(products))
             places = (np.arange(count) + 0.5 - count / 2) * cell
             for product, weight in zip(products, spectrum.weights, strict=True):
                 steps = _step_fields(places[:, None] - lines, float(product), cell)
@@ -158,6 +163,14 @@ def cyclic_patterns(lit: str, n: int) -> FloatArray:
     """Return patterns (n, P) of 0 and 1: a code of P characters that repeats along n pixels, shifted by 0 to P - 1."""
     places = (np.arange(n)[:, None] - np.arange(len(lit))) % len(lit)
     return np.asarray(np.array([float(each) for each in lit])[places])
+
+
+def _check_size(camera: CameraGeometry, features: int, cells: int) -> None:
+    """Refuse a side whose waves or transmissions would be more than :data:`_MOST` numbers."""
+    if features * cells > _MOST:
+        place = f"features of {camera.mask_feature * 1e3:g} um, {camera.mask_distance:g} mm from the sensor"
+        problem = f"goal: {place}, are {features} a side on {cells} grid cells, which is too much for a search"
+        raise MitsimError(f"{problem}; use larger feature_um, and mask_distance_mm of a few mm")
 
 
 def _step_fields(x: FloatArray, product: float, cell: float) -> ComplexArray:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,15 +14,15 @@ import tomli_w
 
 from mitsim.core.environment import versions
 from mitsim.core.errors import MitsimError
-from mitsim.core.files import output_folder, write_json, write_text
+from mitsim.core.files import output_folder, read_text, replaced, write_json, write_text
+from mitsim.core.headline import headline
 from mitsim.core.job import Job
-from mitsim.design.goal import Goal, load_goal
+from mitsim.design.goal import Goal
 from mitsim.design.masks import (
     PATTERNS,
-    STATE,
     Candidate,
     run_search,
-    search_of,
+    searches,
     seconds_for,
     sensitivity,
     stand_of,
@@ -60,46 +61,40 @@ class Design:
     def payload(self) -> dict[str, Any]:
         """Return the values of the command line's JSON."""
         candidates = [each.payload() for each in self.candidates]
-        return {"headline": self.headline, **vars(self), "candidates": candidates}
+        best = self.candidates[0]
+        return {"headline": self.headline, "psnr": best.rendered, **vars(self), "candidates": candidates}
 
     @property
     def table(self) -> Part:
         """Return predicted and rendered PSNR of all masks."""
-        head = ("mask", "patterns", "predicted [dB]", "rendered [dB]", "scatter of seeds [dB]", "open part a side",
-                "exposure [s]", "session [s a frame]", "codes tried")  # fmt: skip
-        rows = tuple(
-            (
-                each.name,
-                each.choice.shown,
-                f"{each.predicted:.2f}",
-                f"{each.rendered:.2f}",
-                f"{each.scatter:.2f}",
-                f"{each.found.code.mean():.2f}",
-                f"{each.exposure_total_s:.3g}",
-                f"{each.session_s:.3g}",
-                str(each.found.evaluations),
-            )
-            for each in self.candidates
-        )
-        notes = [f"Expected change by {name}: {change:+.1f} dB." for name, change in self.sensitivity.items()]
+        head = ("mask", "patterns", "predicted [dB]", "rendered [dB]", "scatter [dB]", "open part", "exposure [s]",
+                "calibration frame [s]", "codes tried")  # fmt: skip
+        rows = list[tuple[str, ...]]()
+        for each in self.candidates:
+            numbers = each.predicted, each.rendered, each.scatter, each.found.code.mean()
+            taken = (f"{one:.3g}" for one in (each.exposure_total_s, each.session_s, each.found.evaluations))
+            rows.append((each.name, each.choice.shown, *(f"{one:.2f}" for one in numbers), *taken))
+        notes = ["Scatter is that of single captures; open part is that of the features of a side."]
+        notes += [f"Camera file, drawings and patterns that were found: {self.output}/design/, and so on."]
+        notes += [f"Expected change by {name}: {change:+.1f} dB." for name, change in self.sensitivity.items()]
         notes += [f"The design has reached a bound: {name}." for name in self.bounds]
         if self.seconds_for_psnr is not None:
             notes.append(f"The wanted PSNR needs {self.seconds_for_psnr:.3g} s of exposure.")
         if not self.complete:
             notes.append("The time limit ended the search; --resume makes the remaining starts.")
-        return Part("PSNR", self.candidates[0].choice.words, head, rows, notes=tuple(notes))
+        return Part("PSNR", self.candidates[0].choice.words, head, tuple(rows), notes=tuple(notes))
 
     def lines(self) -> list[str]:
         """Return the report as lines of text."""
-        patterns = [f"Patterns: {self.output}/design/{PATTERNS}"] if self.candidates[0].choice.lit else []
-        return [self.headline, *self.table.lines(), f"Camera file: {self.output}/design/camera.toml", *patterns]
+        return [self.headline, *self.table.lines()]
 
     @property
     def headline(self) -> str:
         best = self.candidates[0]
-        rest = max((each for each in self.candidates[1:]), key=lambda each: each.rendered, default=best)
-        gain = f", {best.rendered - rest.rendered:+.1f} dB over the best simple mask ({rest.name})"
-        return f"Found a mask with PSNR {best.rendered:.1f} dB rendered, {best.predicted:.1f} dB predicted{gain}"
+        rest = max(self.candidates[1:], key=lambda each: each.rendered)
+        gain = f"{best.rendered - rest.rendered:+.1f} dB over the best simple mask ({rest.name})"
+        made = f"Found a mask with PSNR {best.rendered:.1f} dB rendered, {best.predicted:.1f} dB predicted, {gain}"
+        return headline(made, self.warnings)
 
 
 # -------- Proof
@@ -139,26 +134,32 @@ def prove(goal: Goal, candidate: Candidate, camera: Path, job: Job) -> Candidate
 
 
 def design(
-    goal: Goal | Path | str, output: Path | str, job: Job | None = None, resume: bool = False, overwrite: bool = False
+    asked: Goal, output: Path | str, job: Job | None = None, resume: bool = False, overwrite: bool = False
 ) -> Design:
-    """Search a mask for a ``goal``, prove it by rendered images, and write its files; see :func:`mitsim.design`."""
+    """Search a mask for a goal, prove it by rendered images, and write its files; see :func:`mitsim.design`."""
     from mitsim.api.bench import open_bench
 
-    job, asked = job or Job(), goal if isinstance(goal, Goal) else load_goal(goal)
-    earlier = Path(output) / GOAL
+    job, earlier, text = (
+        job or Job(),
+        Path(output) / GOAL,
+        tomli_w.dumps(asked.model_dump(mode="json", exclude_none=True)),
+    )
     same = resume and earlier.is_file()
-    if same and load_goal(earlier) != asked:
+    if same and read_text(earlier, 1 << 16) != text:
         raise MitsimError(f"output {output}: was begun for another goal; give its own goal, or another folder")
-    with output_folder(output, overwrite=same or (overwrite and (Path(output) / STATE).is_file())) as folder:
-        if overwrite and not same:
-            (folder / STATE).unlink(missing_ok=True)
-        write_text(folder / GOAL, tomli_w.dumps(asked.model_dump(mode="json", exclude_none=True)))
+    aside = replaced(Path(output), (DESIGN,)) if overwrite else nullcontext()
+    with aside, output_folder(output, overwrite=same) as folder:
         with job.clock.stage("open scene"):
             bench = open_bench(asked.scene, camera=asked.camera)
         with job.clock.stage("transport"):
             stand, session_s = stand_of(bench, asked.seed)
         with job.clock.stage("search"):
-            candidates, complete = run_search(stand, asked, folder, job, session_s)
+            every = searches(stand, asked, session_s)
+        head = {"kind": "design", "versions": versions(), "command": job.command, "scene": str(asked.scene)}
+        write_json(folder / DESIGN, {**head, "status": "incomplete"})
+        write_text(folder / GOAL, text)
+        with job.clock.stage("search"):
+            candidates, complete = run_search(stand, asked, folder, job, session_s, every)
         proved = []
         for number, each in enumerate(candidates):
             job.progress("proof", number / len(candidates))
@@ -166,21 +167,17 @@ def design(
             with job.clock.stage("proof"):
                 proved.append(prove(asked, each, file, job.apart(f"{each.name} ")))
         best, *simple = proved
-        own = search_of(stand, asked, best.choice, session_s)
+        own = every[best.choice]
         texts = dict.fromkeys(text for each in proved for text in each.warnings)
         warnings = [f"{', '.join(each.name for each in proved if text in each.warnings)}: {text}" for text in texts]
         if best.rendered < best.predicted - _SHORT_DB:
-            warnings.append(
-                f"The rendered image has {best.predicted - best.rendered:.1f} dB less than predicted; a cause that the "
-                "search lacks matters in this scene"
-            )
+            short = f"by {best.predicted - best.rendered:.1f} dB; a cause that the prediction lacks matters"
+            warnings.append(f"The rendered image is worse than predicted: {short} in this scene")
         rival = max(simple, key=lambda each: each.rendered)
         scatter = math.hypot(best.scatter, rival.scatter) / math.sqrt(asked.seeds)
         if best.rendered - rival.rendered <= 2 * scatter:
-            warnings.append(
-                f"The design is not better than a simple mask ({rival.name}, {rival.rendered:.2f} dB) by more than the "
-                f"scatter of seeds (two standard errors are {2 * scatter:.2f} dB); take the simple mask"
-            )
+            known = f"{rival.name} has {rival.rendered:.2f} dB, with two standard errors of {2 * scatter:.2f} dB"
+            warnings.append(f"The design is no better than a simple mask: {known}; take it, or use more seeds")
         found = Design(
             candidates=tuple(proved),
             bounds=tuple(own.active_bounds(best.found.code)),
@@ -191,8 +188,8 @@ def design(
             output=str(folder),
             warnings=tuple(warnings),
         )
-        write_json(folder / DESIGN, {**found.payload(), "kind": "design", "versions": versions()})
         draw(found, folder, bench)
+        write_json(folder / DESIGN, {**head, **found.payload(), "status": "complete"})
     return found
 
 
@@ -200,27 +197,19 @@ def draw(found: Design, folder: Path, bench: Bench) -> None:
     """Write figures and the page of a design."""
     names = [each.name for each in found.candidates]
     masks = {"": [(np.outer(each.found.code, each.found.code), each.found.origin) for each in found.candidates]}
-    rendered = ((each.image, f"PSNR {each.rendered:.1f} dB") for each in found.candidates)
-    images = [(image, caption) for image, caption in rendered if image is not None]
-    causes = dict[str, dict[str, Mean]]()
-    for each in found.candidates:
-        least = _SHOWN * 10 ** (-each.predicted / 10)
-        shown = {
+    images = {"": [(each.image, f"PSNR {each.rendered:.1f} dB") for each in found.candidates]}
+    causes = {
+        each.name: {
             name.replace("_", " "): Mean(square**0.5, 0.0, 1)
-            for name, square in (each.causes or {}).items()
-            if square > least
+            for name, square in each.causes.items()
+            if square > _SHOWN * 10 ** (-each.predicted / 10)
         }
-        causes[each.name] = shown
-    figures = {
-        "masks.png": image_grid(masks, names),
-        "images.png": image_grid({"": images}, names),
-        "causes.png": grouped_bars(causes, "expected rms error of reflectance"),
+        for each in found.candidates
     }
-    drawn = write_figures(folder, figures)
-    pictures = {file: page_figure(figure) for file, figure in drawn.items()}
-    title = "Design of a mask"
-    section = Section(
-        "design", title, found.headline, found.headline, pictures, (found.table,), warnings=found.warnings
-    )
-    section = replace(section, scene=bench.loaded.path.parent.name, camera=bench.counting.name)
+    bars = grouped_bars(causes, "expected rms error of reflectance")
+    figures = {"masks.png": image_grid(masks, names), "images.png": image_grid(images, names), "causes.png": bars}
+    pictures = {file: page_figure(figure) for file, figure in write_figures(folder, figures).items()}
+    title, scene = "Design of a mask", bench.loaded.path.parent.name
+    section = Section("design", title, found.headline, found.headline, pictures, (found.table,))
+    section = replace(section, warnings=found.warnings, scene=scene, camera=bench.counting.name)
     write_page([section], folder / "report.html", title)

@@ -14,7 +14,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.files import read_json, write_json
 from mitsim.core.job import Job
 from mitsim.design.goal import Goal, load_goal
-from mitsim.design.masks import STATE, Candidate, Choice, objectives, run_search, stand_of, write_camera
+from mitsim.design.masks import STATE, Candidate, Choice, objectives, run_search, searches, stand_of, write_camera
 from mitsim.design.predict import Stand
 from mitsim.design.search import Found, Search
 from mitsim.optics.terms import ModelledCamera
@@ -38,8 +38,11 @@ def stand() -> Stand:
     ("line", "words"),
     [
         ('exposures = "peak"', "equal peak"),
-        ("open_part = [0.5, 0.2]", "open_part: got 0.5 to 0.2"),
-        ("exposure_total_s = -1", "exposure_total_s"),
+        ("open_part = [0.5, 0.2]", "open_part got 0.5 to 0.2"),
+        ("exposure_total_s = nan", "exposure_total_s nan"),
+        ("mask_distance_mm = [1e300]", "mask_distance_mm 1e+300"),
+        ("prior = [0.4, 0.2, 1.0]", "prior 1.0"),
+        ("open_part = [nan, 1.0]", "open_part nan"),
         ("patterns = []", "patterns"),
         ('patterns = ["cyclic:3x5"]', "one period P"),
         ("feature = 60", "feature_um"),
@@ -57,21 +60,72 @@ def test_a_goal_names_what_it_cannot_have(tmp_path: Path, line: str, words: str)
 
 
 def test_patterns_and_scenes_that_do_not_exist_are_refused_before_the_search(tmp_path: Path) -> None:
-    for change in ({"scene": "nosuch"}, {"patterns": ("dots:0",)}, {"patterns": ("cyclic:0",)}, {"camera": "nosuch"}):
-        with pytest.raises(MitsimError):
+    """Unlike fields of a file, they may need other files. (Planted: only the first family checked.)"""
+    many = {"feature_um": (50.0, 60.0, 70.0), "mask_distance_mm": tuple(map(float, range(1, 12)))}
+    for change, words in (
+        ({"scene": "nosuch"}, "nosuch"),
+        ({"patterns": ("dots:3", "dots:500")}, "K is 500"),
+        ({"patterns": ("cyclic:0",)}, "K is 0"),
+        ({"patterns": ("dots:3", "nosuch")}, "goal: patterns 'nosuch'"),
+        ({"camera": "nosuch"}, "nosuch"),
+        ({"camera": "imx249_rggb"}, "without a mosaic"),
+        (many, "33 combinations"),
+    ):
+        with pytest.raises(MitsimError, match=words):
             ms.design(Goal(**(GOAL | change)), tmp_path / "out")
         assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"feature_um": (0.01,)}, "too narrow for the model of diffraction"),
+        ({"feature_um": (0.5,)}, "too much for a search"),
+        ({"mask_distance_mm": (1e-4,)}, "too much for a search"),
+        ({"mask_distance_mm": (500.0,)}, "must be less than scene_distance"),
+        ({"scene_distances_mm": (1.0,)}, "must be less than scene_distance"),
+        ({"open_part": (0.501, 0.5015)}, "no whole number"),
+        ({"patterns": ("hadamard:8",)}, "differences of two frames"),
+    ],
+)
+def test_a_goal_that_no_mask_meets_is_refused(stand: Stand, change: dict[str, Any], words: str) -> None:
+    """Before memory is taken. (Planted: no look at sizes, at signs, at the camera's own rules.)"""
+    with pytest.raises(MitsimError, match=words):
+        list(searches(stand, Goal(**(GOAL | {"patterns": ("dots:7",)} | change)), 0.01))
+
+
+def test_a_camera_of_too_few_pixels_is_refused(stand: Stand) -> None:
+    """Its images need a lambda, which no goal has."""
+    tiny = stand.bench.geometry.model_copy(update={"pixels": 4, "rows": None, "columns": None})
+    bench = replace(stand.bench, devices=replace(stand.bench.devices, camera=tiny))
+    with pytest.raises(MitsimError, match="too few data"):
+        objectives(replace(stand, bench=bench), Goal(**GOAL), CHOICE, 0.01)
+
+
+def test_paths_of_a_goal_count_from_its_file(tmp_path: Path) -> None:
+    """(Planted: from the working folder.)"""
+    (tmp_path / "goal.toml").write_text(
+        'scene = "photograph"\ncamera = "own/c.toml"\npatterns = ["p.npy", "dots:3"]\nexposure_total_s = 1.0\n'
+    )
+    goal = load_goal(tmp_path / "goal.toml")
+    assert goal.scene == "photograph" and goal.camera == str(tmp_path / "own" / "c.toml")
+    assert goal.patterns == (str(tmp_path / "p.npy"), "dots:3")
+
+
 def test_a_resumed_search_ends_as_one_without_a_stop(stand: Stand, tmp_path: Path) -> None:
-    """Cyclic patterns begin with dots, and are in a file by which a capture shows them."""
+    """Cyclic patterns begin with dots, and are in a file by which a capture shows them. Damaged work is refused.
+    (Planted: codes of any length.)"""
     coarse = GOAL | {"exposure_total_s": 0.4, "feature_um": (240.0,)}
     goal = Goal(**coarse, starts=2, patterns=("cyclic:3",))
-    whole, complete = run_search(stand, goal, tmp_path, Job(), 0.01)
-    state = read_json(tmp_path / STATE)
+
+    def search() -> tuple[list[Candidate], bool]:
+        return run_search(stand, goal, tmp_path, Job(), 0.01, searches(stand, goal, 0.01))
+
+    whole, complete = search()
+    state = read_json(tmp_path / STATE)["starts"]
     first = next(iter(state))
-    write_json(tmp_path / STATE, {first: state[first][:1]})
-    found, _ = run_search(stand, goal, tmp_path, Job(), 0.01)
+    write_json(tmp_path / STATE, {"starts": {first: state[first][:1]}})
+    found, _ = search()
     assert complete and len(state) == 2
     for one, other in zip(whole, found, strict=True):
         assert one.name == other.name and one.found.score == other.found.score and one.choice == other.choice
@@ -83,6 +137,11 @@ def test_a_resumed_search_ends_as_one_without_a_stop(stand: Stand, tmp_path: Pat
     lit = np.arange(stand.bench.n)[:, None] % 3 != np.arange(3)
     for side in (shown.left, shown.right):
         assert {*map(tuple, side.T)} == {*map(tuple, lit.T)}
+    kept = (tmp_path / STATE).read_text()
+    for damage in (kept[:-9], kept.replace('"code": "', '"code": "0'), '{"starts": 3}', "[]"):
+        (tmp_path / STATE).write_text(damage)
+        with pytest.raises(MitsimError, match=STATE):
+            search()
 
 
 def test_the_drawn_mask_casts_the_shadow_of_the_code(stand: Stand, tmp_path: Path) -> None:

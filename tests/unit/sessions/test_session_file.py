@@ -125,6 +125,7 @@ def test_paths_are_written_as_seen_from_the_file(write: Callable[[str], Path], t
     tables = {
         "scene": {"scene": str(tmp_path / "s" / "photograph"), "camera": str(tmp_path / "s" / "camera.toml")},
         "capture": {"patterns": str(tmp_path / "s" / "own.npy")},
+        "design": {"scene": "cards", "exposure_total_s": 1.0, "patterns": [str(tmp_path / "s" / "own.npy"), "dots:3"]},
         "reconstruct": [{"run": str(tmp_path / "run"), "calibration": "/elsewhere/cal"}],
     }
     text = session_text(tables, tmp_path / "s")
@@ -215,6 +216,7 @@ def test_nothing_is_written_where_a_step_would_be_refused(write: Callable[[str],
         ("[capture]\n[calibrate]\nrecipe = 'none.toml'\n[reconstruct]\ncalibration = './no'\n", "has 2 mistakes"),
         ("[capture]\n[calibrate]\n[reconstruct]\nchart = 'nosuch'\n", "the frames are not coloured"),
         ("[capture]\npatterns = 'dots:200'\n", "dots:200"),
+        ("[design]\nscene = 'photograph'\nexposure_total_s = 1.0\npatterns = ['dots:500']\n", "K is 500"),
         ("[capture]\ncolour = 'mosaic'\n", "has no mosaic of colour filters"),
     ):
         with pytest.raises(ms.MitsimError) as refused:
