@@ -100,11 +100,14 @@ class Design:
 # -------- Proof
 
 
-def prove(goal: Goal, candidate: Candidate, camera: Path, job: Job) -> Candidate:
-    """Predict, capture, calibrate and reconstruct with the ``camera`` of a candidate, once for each seed."""
+def prove(goal: Goal, candidate: Candidate, camera: Path, job: Job, bench: Bench | None = None) -> Candidate:
+    """Predict, capture, calibrate and reconstruct with the ``camera`` of a candidate, once for each seed.
+
+    ``bench`` has that camera; None: the goal's scene is opened with it.
+    """
     from mitsim.api.bench import open_bench
 
-    bench = open_bench(goal.scene, camera=str(camera))
+    bench = bench or open_bench(goal.scene, camera=str(camera))
     patterns = str(camera.parent / PATTERNS) if candidate.choice.lit else candidate.choice.patterns
     frames = len(bench.family(patterns).shots)
     predicted = bench.predict(patterns, exposure_total=candidate.exposure_total_s, job=job)
