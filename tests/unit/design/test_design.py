@@ -14,7 +14,18 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.files import read_json, write_json
 from mitsim.core.job import Job
 from mitsim.design.goal import Goal, load_goal
-from mitsim.design.masks import STATE, Candidate, Choice, objectives, run_search, searches, stand_of, write_camera
+from mitsim.design.masks import (
+    STATE,
+    Candidate,
+    Choice,
+    objectives,
+    run_search,
+    searches,
+    seconds_for,
+    sensitivity,
+    stand_of,
+    write_camera,
+)
 from mitsim.design.predict import Stand
 from mitsim.design.search import Found, Search
 from mitsim.optics.terms import ModelledCamera
@@ -174,6 +185,17 @@ def test_equal_light_exposes_a_darker_mask_for_longer(stand: Stand) -> None:
     choice = replace(CHOICE, patterns="cyclic:3", lit="110")
     (lit,) = objectives(stand, Goal(**(GOAL | {"exposure_total_s": 0.4}), exposures="light"), choice, 0.01)
     assert objective.lit_by("110")((half, half)).total == pytest.approx(lit((half, half)).total, rel=1e-3)
+
+
+def test_the_exposure_for_a_psnr_reaches_it(stand: Stand) -> None:
+    """(Planted: the sign of a loss; seconds of the goal in place of those found.)"""
+    goal = Goal(**GOAL, wanted_psnr_db=25.0)
+    code = (search := Search(objectives(stand, goal, CHOICE, 0.01))).maximum_length().code
+    seconds = seconds_for(search, code, goal)
+    (again,) = objectives(stand, goal.model_copy(update={"exposure_total_s": seconds}), CHOICE, 0.01)
+    assert again((code, code)).psnr_db == pytest.approx(25.0, abs=0.02)
+    assert sensitivity(search, code)["a tenth of the light"] < -1
+    assert seconds_for(search, code, goal.model_copy(update={"wanted_psnr_db": 99.0})) is None
 
 
 @pytest.mark.slow
