@@ -22,7 +22,7 @@ import mitsim
 ROOT = Path(__file__).resolve().parents[1]
 PICTURES = "docs/_build/notebooks"
 TUTORIALS = "shifting_dots", "own_camera_and_picture", "calibration", "noise", "diffraction", "ambient_light", "gloss"
-TUTORIALS += "interreflection", "depth", "real_captures", "networks"
+TUTORIALS += "interreflection", "depth", "mask_design", "real_captures", "networks"
 """Notebooks in the order to learn by."""
 
 project = "mitsim"

@@ -31,6 +31,7 @@ from mitsim.core.manifests import (
     _Head,
 )
 from mitsim.core.picture_files import Crop, Preparation, Raw
+from mitsim.design.goal import Goal
 from mitsim.devices.camera import CameraGeometry, MaskProfile
 from mitsim.devices.framelist import ChartPlace, DarkFile, FrameList, KnownCapture, KnownList, StripeFile
 from mitsim.devices.projector import Coherence, ProjectorModel
@@ -51,6 +52,7 @@ MODELS = (
     *(ColourManifest, Line, ChartPlace),
     MosaicManifest,
     Variation,
+    Goal,
 )
 
 
@@ -61,6 +63,8 @@ def default_text(value: object) -> str:
     """Return a field's default ``value`` in words."""
     if value is None or value in ({}, (), "") or isinstance(value, BaseModel):
         return "none"
+    if isinstance(value, tuple):
+        return ", ".join(map(default_text, value))
     if isinstance(value, bool):
         return str(value).lower()
     return "infinite" if value == float("inf") else f"{value:g}" if isinstance(value, float) else str(value)
@@ -70,7 +74,7 @@ def allowed_text(rules: Mapping[str, Any]) -> str:
     """Return the values that a field may have, from the ``rules`` of its JSON schema."""
     if "anyOf" in rules:
         # The default "none" already says that a value may be absent.
-        return ", ".join(allowed_text(choice) for choice in rules["anyOf"] if choice.get("type") != "null")
+        return ", ".join({allowed_text(choice): 1 for choice in rules["anyOf"] if choice.get("type") != "null"})
     if "const" in rules or "enum" in rules:
         return ", ".join(f"`{value}`" for value in rules.get("enum", [rules.get("const")]))
     if "$ref" in rules or rules.get("type") == "object":

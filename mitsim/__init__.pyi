@@ -20,6 +20,8 @@ from mitsim.core.runs import Capture as Capture
 from mitsim.core.runs import MosaicCapture as MosaicCapture
 from mitsim.core.runs import load_mosaic as load_mosaic
 from mitsim.core.runs import load_run as load_run
+from mitsim.design.goal import Goal as Goal
+from mitsim.design.predict import Prediction as Prediction
 from mitsim.devices.session import Modelling as Modelling
 from mitsim.devices.session import load_recipe as load_recipe
 from mitsim.exchange.formats import export as export
@@ -48,10 +50,12 @@ from mitsim.sessions.session_file import session_of as session_of
 from mitsim.verbs import characterise as characterise
 from mitsim.verbs import compare as compare
 from mitsim.verbs import demo as demo
+from mitsim.verbs import design as design
 from mitsim.verbs import doctor as doctor
 from mitsim.verbs import load_network as load_network
 from mitsim.verbs import make_pairs as make_pairs
 from mitsim.verbs import pairs as pairs
+from mitsim.verbs import predict as predict
 from mitsim.verbs import scenes as scenes
 from mitsim.verbs import sense as sense
 from mitsim.verbs import study as study

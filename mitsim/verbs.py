@@ -20,6 +20,7 @@ from mitsim.bench.request import (
     Irradiance,
     Opening,
     Planned,
+    PredictRequest,
     Procedure,
     Request,
     Sampled,
@@ -68,6 +69,8 @@ if TYPE_CHECKING:
     from mitsim.api.bench import Bench
     from mitsim.core.arrays import FloatArray
     from mitsim.core.runs import Capture
+    from mitsim.design.goal import Goal
+    from mitsim.design.predict import Prediction
     from mitsim.learn.networks import LearnedSolver, Trained
     from mitsim.learn.pair_store import PairStore
     from mitsim.light.plan import Plan
@@ -77,6 +80,7 @@ if TYPE_CHECKING:
     from mitsim.studies.demo import DemoResult
     from mitsim.studies.framework.campaign import StudyResult
     from mitsim.studies.framework.experiment import Scope
+    from mitsim.studies.mask_design import Design
 
 
 # ---- this machine, and what is shipped -------------------------------------------------------------------------------
@@ -169,6 +173,35 @@ def calibrate_in(bench: Bench, colour: str, request: SessionRequest, task: Task)
     if request.recipe is not None and request.recipe.depths:
         return {f"{depth:g}": each for depth, each in bench.calibrate_depths(**where).items()}
     return {"": bench.calibrate(**where)}
+
+
+class Predicted(PredictRequest, Opening):
+    """A prediction, and what opens its bench."""
+
+    VERB = "predict"
+
+
+@takes(Predicted, without="patterns")
+def predict(scene: Path | str, patterns: str = "dots:7", job: Job | None = None, **options: Any) -> Prediction:
+    """Open a bench, and predict the PSNR of an image and its errors by cause; see :meth:`mitsim.Bench.predict`.
+
+    Parameters
+    ----------
+    scene
+        name of a shipped one, or a path.
+    patterns
+        name of a family.
+    job
+        clock and progress.
+
+    Raises
+    ------
+    MitsimError
+        for files that cannot be used, a request that cannot be served, and a mask without factors.
+    """
+    asked, job = Predicted(patterns=patterns, **options), job or Job()
+    asked.check(scene, asked.patterns, asked.timing)
+    return open_as(scene, asked, job).predict(job=job, **asked.part(PredictRequest).given)
 
 
 # ---- the demo --------------------------------------------------------------------------------------------------------
@@ -391,8 +424,8 @@ def scope_of(
             others = "measure is for sweep; over for drift, sweep; patterns for accuracy, calibration, drift, sweep"
             raise MitsimError(f"study {name}: measures its own points; {others}")
         return scope
-    read_name(patterns)
-    return replace(scope, sweep=tuple(varied), patterns=patterns)
+    sweep = ((name, tuple(map(read_name, texts)) if name == "patterns" else texts) for name, texts in varied)
+    return replace(scope, sweep=tuple(sweep), patterns=read_name(patterns))
 
 
 def _check_setup(scope: Scope, scene: str | None) -> None:
@@ -414,6 +447,67 @@ def _check_setup(scope: Scope, scene: str | None) -> None:
     from mitsim.devices.projector import ProjectorModel  # last: it imports numpy
 
     load_model(projector, ProjectorModel)
+
+
+class DesignOptions(Options):
+    """How a design is run."""
+
+    VERB = "design"
+
+    resume: bool = option(False, "continue a search that was stopped, for the same goal", panel=OUTPUT)
+    overwrite: bool = option(False, "replace an earlier design in the folder", panel=OUTPUT)
+
+
+@takes(DesignOptions)
+def design(
+    goal: Path | str | Goal, output: Path | str = "design-output", job: Job | None = None, **options: Any
+) -> Design:
+    """Search the mask with the least expected error, and prove it by rendered images beside simple masks.
+
+    Parameters
+    ----------
+    goal
+        Goal file, as `mitsim new goal` writes one, or a :class:`mitsim.design.goal.Goal`.
+    output
+        Folder of design.json, page, figures, and a camera file with the drawing of each mask.
+    job
+        Clock, progress and limits.
+
+    Raises
+    ------
+    MitsimError
+        for a goal that no code meets, which is named, files that cannot be used, and a folder that holds something
+        else.
+
+    Examples
+    --------
+    >>> import mitsim as ms
+    >>> ms.design("goal.toml", "design").headline  # doctest: +SKIP
+    """
+    return prepare_design(goal, output, DesignOptions(**options))(job)
+
+
+def prepare_design(goal: Path | str | Goal, output: Path | str, asked: DesignOptions) -> Callable[[Job | None], Design]:
+    """Check a design before the renderer is imported, and return the function that runs it."""
+    if asked.resume and asked.overwrite:
+        raise ArgumentError("overwrite", "replaces the work that resume continues; give one of both")
+    from mitsim.design.goal import Goal, load_goal
+
+    checked = goal if isinstance(goal, Goal) else load_goal(goal)
+    try:
+        own = (each if each.startswith("cyclic:") else read_name(each) for each in checked.patterns)
+        checked = checked.model_copy(update={"patterns": tuple(own)})
+        checked.check_count()
+        for patterns in checked.families:
+            Opening(camera=checked.camera).check(checked.scene, patterns)
+    except ArgumentError as error:  # of a field, not of an option
+        raise MitsimError(f"goal: {error}") from None
+    if checked.camera and load_sensor(locate(checked.camera, "calibration", ".toml", CAMERA)).mosaic:
+        problem = f"goal: camera {checked.camera}: has colour filters, and masks are searched for one line of light"
+        raise MitsimError(f"{problem}; give a camera without a mosaic, such as imx249")
+    from mitsim.studies.mask_design import design as run_design  # only now: it takes seconds to import
+
+    return partial(run_design, checked, output, resume=asked.resume, overwrite=asked.overwrite)
 
 
 class CompareOptions(Styled):

@@ -28,6 +28,7 @@ CALLS = {
     "demo": ["demo"],
     "run": ["run", "session_of"],
     "view": ["Bench.view"],
+    "predict": ["predict", "Bench.predict"],
     "plan": ["Bench.plan", "Bench.choose_colour", "Plan.save"],
     "capture": ["Bench.capture", "Bench.capture_lines", "Bench.capture_mosaic", "Light.expose"],
     "calibrate": ["Bench.calibrate", "Bench.calibrate_lines", "Bench.calibrate_mosaic", "Bench.calibrate_depths",
@@ -35,6 +36,7 @@ CALLS = {
     "reconstruct": ["reconstruct", "reconstruct_colours", "reconstruct_psf", "Reconstruction.save"],
     "render": ["Bench.render", "Rendered.save"],
     "study": ["study"],
+    "design": ["design"],
     "compare": ["compare"],
     "show": ["show"],
     "report": ["report", "report_folder"],
@@ -59,6 +61,7 @@ ONE_CALL = [
     "run",
     "study",
     "compare",
+    "design",
     "import",
     "patterns",
     "characterise",
@@ -161,7 +164,7 @@ WRONG: list[Any] = [
 OF_A_BENCH = [object(), b"x", 1j, np.array([]), np.array([1j]), np.array([None])]
 """Values that no argument of a bench may be."""
 RENDERS = {"open_bench", "make_pairs", "pairs", "calibrate_model", "plan_calibration", "demo", "run", "study"}
-RENDERS |= {"doctor", "train"}
+RENDERS |= {"doctor", "predict", "train"}
 """What may begin long work by an argument of the right kind: it gets those of no kind alone."""
 CLASSES = ["Clock", "Job", "Limits", "Modelling", "Request"]
 """Classes that users make things of."""

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from mitsim.bench.apparatus import Apparatus, open_apparatus, reopen
-from mitsim.bench.request import Planned, Request, SessionRequest, Task, Working
+from mitsim.bench.request import Planned, PredictRequest, Request, SessionRequest, Task, Working
 from mitsim.core.configuration import takes
 from mitsim.core.environment import DEFAULT_VARIANT
 from mitsim.core.errors import ArgumentError, check_arguments, is_masked
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from mitsim.acquire.capture import Light, Rendered
     from mitsim.acquire.spectral import Coloured
     from mitsim.core.runs import Capture, MosaicCapture
+    from mitsim.design.predict import Prediction
     from mitsim.devices.session import BoardShape
     from mitsim.light.plan import Plan
     from mitsim.reconstruct.factors import Factors
@@ -76,9 +77,9 @@ def open_bench(
 
 # ---- The bench and its verbs ----
 
-_LISTED = """view plan light transport capture capture_lines capture_mosaic choose_colour calibrate calibrate_lines
-calibrate_mosaic calibrate_depths write_session render with_board in_variant in_bands family geometry sensor projector n
-variant"""
+_LISTED = """view plan predict light transport capture capture_lines capture_mosaic choose_colour calibrate
+calibrate_lines calibrate_mosaic calibrate_depths write_session render with_board in_variant in_bands family
+geometry sensor projector n variant"""
 """Names that ``dir(bench)`` lists."""
 
 
@@ -125,7 +126,7 @@ class Bench(Apparatus):
         Parameters
         ----------
         patterns
-            Name of a family (:func:`mitsim.devices.patterns.parse_patterns`).
+            Name of a family, or own patterns (:func:`mitsim.devices.patterns.parse_patterns`).
 
         Raises
         ------
@@ -158,6 +159,25 @@ class Bench(Apparatus):
         return trace_request(self, patterns, job, asked.seed)
 
     transport = light
+
+    @takes(Working, PredictRequest, without="patterns resume")
+    def predict(self, patterns: str = "dots:7", **request: Any) -> Prediction:
+        """Predict the PSNR of an image, and its errors by cause, without forming frames or solving them.
+
+        Parameters
+        ----------
+        patterns
+            Name of a family.
+
+        Raises
+        ------
+        MitsimError
+            for a request that cannot be served, and a mask without factors.
+        """
+        from mitsim.design.predict import predict
+
+        job = Task.taken(None, request).job
+        return predict(self, PredictRequest(patterns=patterns, **request), job)
 
     # ---- Captures ----
 

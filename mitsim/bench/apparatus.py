@@ -225,7 +225,7 @@ class Apparatus:
         """Return the pattern family on this projector; raise MitsimError if it does not fit."""
         from mitsim.devices.patterns import parse_patterns
 
-        return parse_patterns(patterns, self.n, seed)
+        return parse_patterns(patterns, self.n, seed, self.projector.grey_light)
 
     @check_arguments
     def speckle(self, family: PatternFamily | None = None) -> float:

@@ -173,9 +173,8 @@ def _switches(effects: object) -> dict[str, bool]:
 
 
 def family_of(patterns: str) -> str:
-    """Return the ``patterns``, the name of a family; ArgumentError for another name."""
-    read_name(patterns)
-    return patterns
+    """Return the ``patterns``, a family's name, or a file with its SHA-256; ArgumentError for another name."""
+    return read_name(patterns)
 
 
 class Seeded(Options):
@@ -269,6 +268,57 @@ class SessionRequest(Sampled):
     recipe: SessionRecipe | None = option(
         None, "session recipe, a file of `mitsim new recipe`", metavar="FILE.toml", kind=Path, read=load_recipe
     )
+
+
+def _prior(prior: object) -> tuple[float, float, float]:
+    """Return mean, variance and correlation length [projector pixels] of reflectance; ArgumentError for others."""
+    parts = prior.split(",") if isinstance(prior, str) else prior
+    try:
+        mean, variance, length = (float(str(part)) for part in parts)  # type: ignore[attr-defined]
+    except (TypeError, ValueError):
+        mean = math.nan
+    if not (0 < mean <= 1 and 0 <= variance <= 1 and 0 < length <= 1e6):
+        allowed = "give MEAN,VARIANCE,LENGTH: reflectance above 0 to 1, 0 to 1, and above 0 to 1e6 projector pixels"
+        raise ArgumentError("prior", f"{short_text(prior)}: {allowed}")
+    return mean, variance, length
+
+
+class PredictRequest(Timed, Family):
+    """Which image is predicted: its patterns, exposure, calibration and scene."""
+
+    VERB = "predict"
+
+    exposure_total: float | None = option(
+        None, "seconds of all frames together, shared evenly; in place of --exposure", metavar="S", gt=0, le=1e6
+    )
+    recipe: SessionRecipe | None = option(
+        None, "session recipe, a file of `mitsim new recipe`", metavar="FILE.toml", kind=Path, read=load_recipe
+    )
+    pictures: FilePath | None = option(
+        None, "predict the mean over this folder's pictures instead of the scene's own", metavar="FOLDER", kind=Path
+    )
+    prior: Annotated[Any, validated_by(lambda prior: None if prior is None else _prior(prior))] = option(
+        None, "mean, variance and correlation length [projector pixels] instead of the scene's own reflectance",
+        metavar="MEAN,VARIANCE,LENGTH", kind=str,
+    )  # fmt: skip
+    lam: float | Literal["auto"] = option(
+        "auto", "regularisation lambda; auto: that of the least expected error", "--lambda", metavar="auto|VALUE"
+    )
+
+    def model_post_init(self, context: object) -> None:
+        """Refuse two exposures, and two scenes."""
+        super().model_post_init(context)
+        if self.exposure_total is not None:
+            self.refuse(["exposure", "exposure_fraction"], "beside the seconds of all frames")
+        if self.prior is not None:
+            self.refuse(["pictures"], "on a prior")
+        if self.lam != "auto" and not 0 <= self.lam < math.inf:
+            raise ArgumentError("lam", f"{self.lam}: give auto, or a finite number of at least 0")
+
+    @property
+    def weight(self) -> float | None:
+        """Return lambda; None for auto."""
+        return None if self.lam == "auto" else self.lam
 
 
 # ---- A scene and its devices ----

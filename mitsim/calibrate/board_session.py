@@ -334,6 +334,37 @@ class Response:
     light: FloatArray | None = None
 
 
+def response_variances(
+    session: Session, uniform_rate: FloatArray, exposure_s: float
+) -> tuple[dict[str, FloatArray], dict[str, FloatArray]]:
+    """Return noise variances [(electrons / s)^2], (m, m') or one number: each response's own, and a side's shared.
+
+    Two shots of a pair share the uniform light L: variance (L + 2 D) / t + 2 R / t^2 with dark electrons D and the
+    variance R of reading and rounding. 2 Y(positive) - Y(uniform) for a part p of the lines has (4 p L + 4 D) / t +
+    4 R / t^2 of its own; the uniform shot's (L + D) / t + R / t^2 is shared. Means of repeats have the
+    corresponding part.
+    """
+    sensor, time = session.bench.sensor, exposure_s
+    rounding = 0.0 if sensor.largest_dn is None else 1 / (12 * sensor.gain_dn_per_e**2)
+    single: dict[str, FloatArray | float] = {
+        SHOT: session.through_filters(uniform_rate) / time,
+        DARK: sensor.superpixel_dark_current_e_per_s / time,
+        READ: sensor.superpixel_reading_noise_e**2 / time**2,
+        ROUNDING: rounding / time**2,
+    }
+    # As many times a uniform shot's light, and another shot's other noise, as a response has.
+    lines, own_shots, shared_shots = 0.5, 2.0, 0.0
+    if not session.pairs:
+        lines, own_shots, shared_shots = float((1 + session.signs).mean()) / 2, 4.0, 1.0
+    weight = 1.0 if session.filters is None else 1.0 / np.square(session.filters)
+    own, shared = {}, {}
+    for source, one in single.items():
+        part = lines if source == SHOT else 1.0
+        own[source] = np.asarray(own_shots * part * weight * one / session.recipe.repeats)
+        shared[source] = np.asarray(shared_shots / session.recipe.repeats * weight * one)
+    return own, shared
+
+
 @dataclass(frozen=True, eq=False)
 class LitSession:
     """A session with traced light: its responses, with or without noise.
@@ -376,32 +407,8 @@ class LitSession:
         return float(np.sqrt(sum(every, np.zeros(self.uniform_rate.shape)).mean()))
 
     def response_variances(self) -> tuple[dict[str, FloatArray], dict[str, FloatArray]]:
-        """Return noise variances [(electrons / s)^2], (m, m') or one number: each response's own, and a side's shared.
-
-        Two shots of a pair share the uniform light L: variance (L + 2 D) / t + 2 R / t^2 with dark electrons D and the
-        variance R of reading and rounding. 2 Y(positive) - Y(uniform) for a part p of the lines has (4 p L + 4 D) / t +
-        4 R / t^2 of its own; the uniform shot's (L + D) / t + R / t^2 is shared. Means of repeats have the
-        corresponding part.
-        """
-        session, sensor, time = self.session, self.session.bench.sensor, self.exposure_s
-        rounding = 0.0 if sensor.largest_dn is None else 1 / (12 * sensor.gain_dn_per_e**2)
-        single: dict[str, FloatArray | float] = {
-            SHOT: session.through_filters(self.uniform_rate) / time,
-            DARK: sensor.superpixel_dark_current_e_per_s / time,
-            READ: sensor.superpixel_reading_noise_e**2 / time**2,
-            ROUNDING: rounding / time**2,
-        }
-        # As many times a uniform shot's light, and another shot's other noise, as a response has.
-        lines, own_shots, shared_shots = 0.5, 2.0, 0.0
-        if not session.pairs:
-            lines, own_shots, shared_shots = float((1 + session.signs).mean()) / 2, 4.0, 1.0
-        weight = 1.0 if session.filters is None else 1.0 / np.square(session.filters)
-        own, shared = {}, {}
-        for source, one in single.items():
-            part = lines if source == SHOT else 1.0
-            own[source] = np.asarray(own_shots * part * weight * one / session.recipe.repeats)
-            shared[source] = np.asarray(shared_shots / session.recipe.repeats * weight * one)
-        return own, shared
+        """Return noise variances of each response's own, and of a side's shared; see :func:`response_variances`."""
+        return response_variances(self.session, self.uniform_rate, self.exposure_s)
 
     def each(self, side: str, use: Callable[[tuple[int, Frame]], Result], job: Job, first: int = 0) -> Iterator[Result]:
         """Apply ``use`` to number and expected frame of the +-1 patterns of a ``side``, in threads.

@@ -26,6 +26,7 @@ from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.request import Exposure, Request, SessionRequest, Task, Working, check_psnr
 from mitsim.calibrate.board_session import LitSession, Session, manifest_of, session_seconds
 from mitsim.calibrate.calibrate import NOISE_FREE, session_sums
+from mitsim.core.arrays import FloatArray
 from mitsim.core.configuration import takes
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.seeds import stream
@@ -276,6 +277,11 @@ def least_dose(quality: Callable[[float], float], wanted: float, smallest: float
     return high
 
 
+def vector_variance(variance: FloatArray, common: FloatArray) -> FloatArray:
+    """Return the variance (m,) of u = Y v / |v|^2, from that of a response Y (m, m') and the ``common`` v (m',)."""
+    return np.asarray(variance @ np.square(common / np.dot(common, common)))
+
+
 def drawn_estimate(lit: LitSession, sums: tuple[StripeSums, StripeSums], draw: int | None) -> Estimate:
     """Estimate factors from noise-free ``sums`` with noise as of the session ``lit``.
 
@@ -290,15 +296,15 @@ def drawn_estimate(lit: LitSession, sums: tuple[StripeSums, StripeSums], draw: i
     )
     sides = []
     for each in sums:
-        across, weights = each.side == SIDES[0], np.square(each.common / np.dot(each.common, each.common))
-        random = stream(lit.session.seed, "foreseen", each.side, draw)
-        noise = np.sqrt((own if across else own.T) @ weights)[:, None] * random.standard_normal(each.vectors.shape)
+        across, random = each.side == SIDES[0], stream(lit.session.seed, "foreseen", each.side, draw)
+        by_row = vector_variance(own if across else own.T, each.common)
+        noise = np.sqrt(by_row)[:, None] * random.standard_normal(each.vectors.shape)
         if shared.any():
-            by_row = (shared if across else shared.T) @ weights
+            by_row = vector_variance(shared if across else shared.T, each.common)
             noise += np.sqrt(by_row)[:, None] * random.standard_normal((len(each.vectors), 1))
         # One number a row (or column) of each response was fitted.
         energy, fitted = each.done * float((own + shared).sum()), 1 - 1 / len(each.common)
-        more = {
+        more: dict[str, Any] = {
             "vectors": each.vectors + noise,
             "misfit": each.misfit + fitted * energy,
             "energy": each.energy + energy,

@@ -16,7 +16,20 @@ import typer
 
 import mitsim
 from mitsim.cli import frame_verbs
-from mitsim.cli.bench_verbs import capture, demo, doctor, pairs, plan, render, run_, study, transport, view
+from mitsim.cli.bench_verbs import (
+    capture,
+    demo,
+    design,
+    doctor,
+    pairs,
+    plan,
+    predict,
+    render,
+    run_,
+    study,
+    transport,
+    view,
+)
 from mitsim.cli.calibrate_verb import calibrate
 from mitsim.cli.commands import Program, Verb, help_of, message_of
 from mitsim.cli.shelf_verbs import list_, new
@@ -43,6 +56,8 @@ def run() -> None:
         Path.cwd()
     except FileNotFoundError:
         _fail("the working folder does not exist any more; change to another one")
+    if sys.argv[1:3] == ["design", "predict"]:  # the same as `mitsim predict`
+        del sys.argv[1]
     try:
         with warnings.catch_warnings(record=True) as found:
             code = app(standalone_mode=False)
@@ -97,9 +112,9 @@ def _root(version: Annotated[bool, typer.Option("--version", help="Print the ver
 
 
 _VERBS = {
-    "Main steps": (demo, run_, view, plan, capture, calibrate, frame_verbs.reconstruct),
+    "Main steps": (demo, run_, view, plan, predict, capture, calibrate, frame_verbs.reconstruct),
     "Light and sensor alone": (render, frame_verbs.sense, frame_verbs.characterise),
-    "Experiments": (study, frame_verbs.compare),
+    "Experiments": (study, frame_verbs.compare, design),
     "Neural networks": (pairs, frame_verbs.train),
     "Real devices and other programs": (frame_verbs.export, frame_verbs.import_, frame_verbs.patterns, transport),
     "Files and installation": (frame_verbs.show, frame_verbs.report, list_, new, doctor),

@@ -49,10 +49,10 @@ from mitsim.core.headline import each_once, frames_headline
 from mitsim.core.job import compiled_kernels, memory_from_here, memory_since, running_seconds
 from mitsim.core.manifests import MANIFEST, resumable
 from mitsim.core.worker import RESUME, advise
-from mitsim.devices.patterns import pattern_names
+from mitsim.devices.patterns import pattern_names, short_name
 from mitsim.learn.requests import PairOptions, PairsRequest
 from mitsim.studies import ALL, EXPERIMENTS
-from mitsim.verbs import DemoRequest, RunOptions, StudyOptions, capture_in, open_as, plan_in
+from mitsim.verbs import DemoRequest, DesignOptions, Predicted, RunOptions, StudyOptions, capture_in, open_as, plan_in
 
 if TYPE_CHECKING:
     from mitsim.light.plan import Plan, PlanRow
@@ -199,6 +199,27 @@ def study(asked: Studying) -> int:
     return asked.call(mitsim.study, asked.name, asked.scenes, asked.output, **asked.given_of(StudyOptions))
 
 
+class Designing(DesignOptions, Common):
+    """Options of `mitsim design`."""
+
+    goal: Path = argument(..., "goal file, as `mitsim new goal NAME` writes one", "GOAL.toml")
+    output: Path = to_make(Path("design-output"), "folder to make for camera files, page and design.json", "DIR")
+
+
+@command
+def design(asked: Designing) -> int:
+    """Search the mask with the least error, and prove it by images.
+
+    Its camera and those of the best simple masks (random, pinholes, maximum length sequence) are captured, calibrated
+    and reconstructed. `mitsim design predict` is `mitsim predict`.
+
+    $ mitsim new goal mine
+    $ mitsim design mine.toml -o design
+    $ mitsim capture photograph --camera design/design/camera.toml -o run
+    """
+    return asked.call(mitsim.design, asked.goal, asked.output, **asked.given_of(DesignOptions))
+
+
 class Checking(Variant, Common):
     """Options of `mitsim doctor`."""
 
@@ -303,6 +324,25 @@ def plan_lines(plan: Plan, everything: bool = False) -> list[str]:
         memory, disk = plan.cost.memory_bytes / 2**30, plan.cost.disk_bytes / 2**20
         lines.append(f"At most {memory:.2g} GiB of memory, {disk:.3g} MiB of disk")
     return lines
+
+
+class Predicting(OfScene, Predicted, Common):
+    """Options of `mitsim predict`."""
+
+    FIRST = "scene patterns"
+
+
+@command
+def predict(asked: Predicting) -> int:
+    """Predict the PSNR of an image by cause, without frames.
+
+    A short trace of the scene's light and closed forms take seconds. Causes that the prediction lacks are named.
+
+    $ mitsim predict photograph --patterns dots:7
+    $ mitsim predict photograph --exposure-total 1 --recipe session.toml
+    $ mitsim predict photograph --prior 0.4,0.03,8 --json
+    """
+    return asked.call(mitsim.predict, asked.scene, **asked.given_of(Predicted))
 
 
 # ---- capture ---------------------------------------------------------------------------------------------------------
@@ -516,7 +556,7 @@ def transport(asked: Tracing) -> int:
     lines = [
         f"Light of {payload['n']}x{payload['n']} projector pixels to {shape[0]}x{shape[1]} of the sensor in "
         f"{taken['total']:.1f} s, {payload['entries']} numbers, {size / 2**20:.3g} MiB: {output}",
-        f"Monte Carlo error {payload['mc_error']:.1e} of the frames of {patterns}, total error up to "
+        f"Monte Carlo error {payload['mc_error']:.1e} of the frames of {short_name(patterns)}, total error up to "
         f"{payload['total_error_bound']:.1e}",
     ]
     return asked.finish(payload, lines, payload["warnings"])

@@ -434,6 +434,10 @@ class Verb(TyperCommand):
 class Program(TyperGroup):
     """Program whose page has its verbs by panels."""
 
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """Return the verb that ``args`` name; `design predict` is the verb `predict`."""
+        return super().resolve_command(ctx, args[1:] if args[:2] == ["design", "predict"] else args)
+
     def format_options(self, ctx: Any, formatter: Any) -> None:
         """Write verbs and options."""
         verbs = ((verb.rich_help_panel, (name, verb.short_help)) for name, verb in self.commands.items())  # type: ignore[attr-defined]

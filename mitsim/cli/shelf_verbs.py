@@ -21,6 +21,8 @@ from mitsim.cli.commands import Common, Replaced, argument, command, to_make
 from mitsim.core import configuration
 from mitsim.core.errors import MitsimError, near_name
 from mitsim.core.files import output_file, whole_folder, write_bytes, write_text
+from mitsim.design.goal import Goal
+from mitsim.devices.pattern_files import OWN
 from mitsim.devices.patterns import FAMILIES
 from mitsim.devices.sensor import load_sensor
 from mitsim.devices.session import load_recipe
@@ -93,7 +95,13 @@ KINDS: Mapping[str, Callable[[], Iterator[Entry]]] = {
         Entry(*each) for each in {**DISCRETISED, **{name: effect.what for name, effect in EFFECTS.items()}}.items()
     ),
     "methods": _methods,
-    "patterns": lambda: (Entry(", ".join(each.forms), _clause(str(each.factor.__doc__))) for each in FAMILIES.values()),
+    "patterns": lambda: (
+        Entry(*each)
+        for each in [
+            *((", ".join(each.forms), _clause(str(each.factor.__doc__))) for each in FAMILIES.values()),
+            ("PATH", f"own patterns: {OWN}"),
+        ]
+    ),
 }
 """Entries of each kind that `mitsim list` knows, as the files and modules state them."""
 
@@ -201,6 +209,7 @@ _STARTERS = {
     "recipe": _Starter("mitsim calibrate photograph -o cal --recipe {}", "session", configuration.RECIPE),
     "session": _Starter("mitsim run {} -o session-output", "demo"),
     "study": _Starter("mitsim study {} -o study --quick"),
+    "goal": _Starter("mitsim design {} -o design"),
     "list": _Starter("mitsim import FRAMES -o run --list {} --camera NAME --exposure SECONDS"),
 }
 
@@ -236,6 +245,9 @@ def _lines(kind: str, name: str, like: Path, mask: str) -> Iterator[str]:
         yield from like.read_text(encoding="utf-8").splitlines()[1:]
     elif kind == "list":  # what `mitsim import` needs beside a camera and an exposure
         yield from starter(CaptureList, {"patterns": "dots:7", "n": 128})
+    elif kind == "goal":
+        begun_goal = Goal(scene="photograph", exposure_total_s=4.0, mask_distance_mm=(2.0,)).model_dump(mode="json")
+        yield from starter(Goal, {name: value for name, value in begun_goal.items() if value not in (None, [])})
     elif kind == "study":
         yield _source("mitsim.studies.starter_study").replace('"starter"', f'"{name}"').rstrip()
 

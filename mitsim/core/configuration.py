@@ -126,11 +126,12 @@ def shipped_path(*parts: str) -> Path:
     return path
 
 
-def read_toml(path: Path | str) -> dict[str, Any]:
+def read_toml(path: Path | str, most: int = _MOST_BYTES) -> dict[str, Any]:
     try:
-        text = read_text(path, _MOST_BYTES).removeprefix(BYTE_ORDER_MARK)
-        # The parser's time grows with the square of the parts of a dotted name.
-        if any(line.count(".") > _MOST_DOTS for line in text.splitlines()):
+        text = read_text(path, most).removeprefix(BYTE_ORDER_MARK)
+        # The parser's time grows with the square of the parts of a dotted name. Numbers of a list have dots, too.
+        lines = (line.split(",") if not {'"', "'"} & {*line} else [line] for line in text.splitlines())
+        if any(part.count(".") > _MOST_DOTS for parts in lines for part in parts):
             raise ValueError(f"a line with over {_MOST_DOTS} dots")
         return tomllib.loads(text)
     except RecursionError as error:

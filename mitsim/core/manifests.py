@@ -138,7 +138,7 @@ class Patterns(_Part):
     """Factors of the patterns, and the shots that show them."""
 
     family: str | None = None
-    """Name of the family, such as `dots:7`."""
+    """Name of the family, such as `dots:7`, or of the file."""
     n: int | None = Field(default=None, ge=1, le=MOST_PIXELS)
     """Projector pixels a side."""
     P_L: Rows

@@ -40,6 +40,16 @@ _LARGEST_FACTOR = 1 << 24
 """Whole numbers that single precision resolves."""
 
 
+def picture_files(folder: Path) -> tuple[Path, ...]:
+    """Return the pictures in a ``folder`` by their names; MitsimError if there are none."""
+    if not folder.is_dir():
+        raise MitsimError(f"pictures {folder}: is no folder; give one of pictures")
+    found = sorted(path for path in folder.iterdir() if path.suffix.lower() in PRINTS)
+    if not found:
+        raise MitsimError(f"pictures {folder}: holds no file that ends in {', '.join(PRINTS)}")
+    return tuple(found)
+
+
 class Raw(Configuration):
     """How files without a header (`.raw`, `.bin`, `.dat`) are read."""
 

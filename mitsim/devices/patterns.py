@@ -12,9 +12,11 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from itertools import count, product
+from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from mitsim.core.errors import ArgumentError, MitsimError
+from mitsim.devices import pattern_files
 
 if TYPE_CHECKING:
     import numpy as np
@@ -75,9 +77,12 @@ class Lighting:
 
 @dataclass(frozen=True, eq=False)
 class PatternFamily:
+    """Factors of patterns, and the ``grey`` pictures that show them, rounded to 8 bits; None for 0/1 and +-1."""
+
     name: str
-    left: PatternFactor
-    right: PatternFactor
+    left: PatternFactor | FloatArray
+    right: PatternFactor | FloatArray
+    grey: pattern_files.GreyPictures | None = None
 
     @property
     def n(self) -> int:
@@ -95,6 +100,8 @@ class PatternFamily:
     def light(self, shot: Shot) -> FloatArray:
         import numpy as np
 
+        if self.grey:
+            return np.asarray(self.grey.light[self.grey.levels[shot.row * self.right.shape[1] + shot.column]])
         pattern = np.outer(self.left[:, shot.row], self.right[:, shot.column]).astype(np.float64)
         return np.asarray(pattern if shot.sign == 0 else (1 + shot.sign * pattern) / 2)
 
@@ -114,13 +121,19 @@ class PatternFamily:
     def lighting(self) -> Lighting:
         import numpy as np
 
-        _, row = np.unique(self.left, axis=0, return_inverse=True)
-        _, column = np.unique(self.right, axis=0, return_inverse=True)
-        label = (row.reshape(-1, 1) * (int(column.max()) + 1) + column.reshape(1, -1)).ravel()
+        if self.grey:
+            levels = self.grey.levels.reshape(len(self.grey.levels), -1)
+            _, label = np.unique(levels, axis=1, return_inverse=True)
+        else:
+            _, row = np.unique(self.left, axis=0, return_inverse=True)
+            _, column = np.unique(self.right, axis=0, return_inverse=True)
+            label = (row.reshape(-1, 1) * (int(column.max()) + 1) + column.reshape(1, -1)).ravel()
         _, first, sorted_label = np.unique(label, return_index=True, return_inverse=True)
         # Numbered by first appearance, so that shifting dots have one class a shot, in the same order.
         by_appearance = np.argsort(first)
         first, labels = first[by_appearance], np.argsort(by_appearance)[sorted_label.ravel()]
+        if self.grey:
+            return Lighting(labels, self.grey.light[levels[:, first]])
         i, j, sign = np.array([(shot.row, shot.column, shot.sign) for shot in self.shots]).T
         sign = sign[:, None]
         pattern = self.left[first // self.n][:, i].T * self.right[first % self.n][:, j].T.astype(np.float64)
@@ -301,19 +314,36 @@ def random_binary(axis: PatternAxis) -> PatternFactor:
     return bits
 
 
-# ---- Names of families, as requests have them ----
+# ---- Names of families and own patterns, as requests have them ----
 
 
 def pattern_names() -> str:
-    *most, last = (form for family in FAMILIES.values() for form in family.forms)
-    return f"{', '.join(most)} or {last}"
+    return f"{', '.join(form for family in FAMILIES.values() for form in family.forms)}, {pattern_files.OWN}"
 
 
-def read_name(text: str, n: int | None = None) -> tuple[Family, list[int]]:
-    """Return family and periods of the patterns ``text``, for ``n`` projector pixels per side (None: any number).
+def is_own(text: str, base: Path = Path()) -> bool:
+    """Return True if the patterns ``text`` are a file or a folder, seen from ``base``, not the name of a family."""
+    return text.partition(":")[0] not in FAMILIES and pattern_files.looks_like_file(text, base)
 
-    Raises MitsimError for an unknown family or Hadamard order, and a K that is not a whole number or outside 1..n.
+
+def short_name(text: str) -> str:
+    """Return the name of patterns for people: that of a family, or of the file."""
+    return pattern_files.split_name(text)[0].name if is_own(text) else text
+
+
+def read_name(text: str, n: int | None = None) -> str:
+    """Return the patterns ``text`` as requests have them, for ``n`` projector pixels per side (None: any number).
+
+    Raises MitsimError for an unknown family or Hadamard order, a K that is not a whole number or outside 1..n, and
+    files that cannot be read.
     """
+    if is_own(text):
+        return pattern_files.own_name(text)
+    _read_family(text, n)
+    return text
+
+
+def _read_family(text: str, n: int | None = None) -> tuple[Family, list[int]]:
     name, colon, size = text.partition(":")
     family = FAMILIES.get(name)
     form = f"{name}:K" if colon else name
@@ -342,22 +372,30 @@ def takes_seed(text: str) -> bool:
 
 
 def shot_count(text: str) -> int:
-    family, periods = read_name(text)
+    family, periods = _read_family(text)
     return periods[0] * periods[-1] * (2 if any(map(family.signed, periods)) else 1)
 
 
-def parse_patterns(text: str, n: int, seed: int = 0) -> PatternFamily:
-    """Return the patterns of a name, one of :func:`pattern_names`, for ``n`` projector pixels per side.
+def parse_patterns(
+    text: str, n: int | tuple[int, int], seed: int = 0, light: tuple[float, ...] | None = None
+) -> PatternFamily:
+    """Return the patterns of a name or file, see :func:`pattern_names`, for ``n`` projector pixels per side.
 
-    Raises MitsimError as :func:`read_name`, and for more shots than a run has.
+    ``light`` is that of each grey level (:attr:`mitsim.devices.projector.ProjectorModel.grey_light`), None if it is not
+    known. Raises MitsimError as :func:`read_name`, for more shots than a run has, and as
+    :func:`mitsim.devices.pattern_files.read_own`.
     """
     from mitsim.core.manifests import MOST_SHOTS  # here: it takes 7 ms to import, and most requests make no patterns
 
-    family, periods = read_name(text, n)
+    sides = (n, n) if isinstance(n, int) else n
+    if is_own(text):
+        own = pattern_files.read_own(text, sides, light)
+        return PatternFamily(short_name(text), own.left, own.right, own.grey)
+    family, periods = _read_family(text, min(sides))
     if (count := shot_count(text)) > MOST_SHOTS:
         raise MitsimError(f"patterns {text!r}: are {count} shots; a run has at most {MOST_SHOTS}, give a smaller K")
-    left = family.factor(PatternAxis(n, periods[0], "left", seed))
-    return PatternFamily(text, left, family.factor(PatternAxis(n, periods[-1], "right", seed)))
+    left = family.factor(PatternAxis(sides[0], periods[0], "left", seed))
+    return PatternFamily(text, left, family.factor(PatternAxis(sides[1], periods[-1], "right", seed)))
 
 
 # ---- Orders in which frames may have been taken ----

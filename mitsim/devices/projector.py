@@ -137,6 +137,10 @@ class ProjectorModel(Configuration):
     """Light of a white pixel over that of a black one.
 
     Without an upper end: inf is a black that is black."""
+    tone_curve: float | Annotated[tuple[float, ...], Field(strict=False, max_length=65536)] = 1.0
+    """Exponent of light against grey level, such as 2.2; or the light of evenly spaced levels, from 0 to 1.
+
+    Only patterns from files have grey levels; 1 is light in proportion to them."""
     ansi_contrast: float | None = Field(default=None, gt=1)
     """Light in the white fields of a 4 x 4 chessboard over that in the black ones; none: the lens scatters nothing.
 
@@ -205,6 +209,13 @@ class ProjectorModel(Configuration):
             raise ValueError("radiant_shares are all 0; at least one line must have power")
         if self.speckle is not None and "speckle_contrast" in self.model_fields_set:
             raise ValueError(f"got speckle_contrast {self.speckle_contrast:g} and the table speckle; give one of them")
+        curve = self.tone_curve
+        if isinstance(curve, tuple):
+            fits = (*curve[:1], *curve[-1:]) == (0, 1) and all(before <= after for before, after in pairwise(curve))
+        else:
+            fits = 0.1 <= curve <= 10
+        if not fits:
+            raise ValueError("tone_curve: give an exponent from 0.1 to 10, or two or more lights that rise from 0 to 1")
         if self.ansi_contrast is not None and not self.ansi_contrast < self.contrast_ratio:
             problem = f"ansi_contrast: got {self.ansi_contrast:g}"
             raise ValueError(f"{problem}, and black pixels leave {self.contrast_ratio:g} (contrast_ratio); give less")
@@ -219,6 +230,13 @@ class ProjectorModel(Configuration):
     @property
     def black_level(self) -> float:
         return 1 / self.contrast_ratio
+
+    @property
+    def grey_light(self) -> tuple[float, ...]:
+        """Return the light of each of 256 grey levels, between black (0) and white (1)."""
+        levels, curve = np.arange(256) / 255, self.tone_curve
+        light = levels**curve if isinstance(curve, float) else np.interp(levels, np.linspace(0, 1, len(curve)), curve)
+        return tuple(np.round(light, 12).tolist())  # powers differ in their last digits between processors
 
     @property
     def glare(self) -> float:

@@ -17,7 +17,7 @@ from mitsim.core.files import check_plain
 from mitsim.core.manifests import MOST_PIXELS, CalibrationManifest, ClosingKind, Digital
 from mitsim.core.picture_files import CORRECTIONS, Crop, Preparation, Raw, Wanted, image_files
 from mitsim.devices.framelist import Identity
-from mitsim.devices.patterns import read_name, takes_seed
+from mitsim.devices.patterns import is_own, read_name, takes_seed
 from mitsim.devices.sensor import check_exposure, digital_of, load_sensor
 
 _OTHERS = {
@@ -43,7 +43,8 @@ class CaptureList(Configuration):
     bits: int | None = Field(default=None, ge=1, le=32)
     """Bits of the camera's whole numbers; none: real numbers, or as in the camera file."""
     patterns: str | None = None
-    """Name of the family, or patterns.json of `mitsim export --format png`, a path from the list's folder."""
+    """Name of the family; or a path from the list's folder: own patterns, or patterns.json of `mitsim export --format
+    png`."""
     n: int | None = Field(default=None, ge=1, le=MOST_PIXELS)
     """Scene pixels a side, without a calibration."""
     seed: int = Field(default=0, ge=0, lt=2**64)
@@ -82,6 +83,10 @@ class CaptureList(Configuration):
         return self
 
 
+def names_file(patterns: str) -> bool:
+    return patterns.endswith(".json") or is_own(patterns)
+
+
 def load_capture_list(name: Path | str) -> CaptureList:
     path = configuration.locate(name, "calibration", ".toml", configuration.LIST)
     data = configuration.read_table(path, "list")
@@ -94,7 +99,7 @@ def load_capture_list(name: Path | str) -> CaptureList:
         return {name: str(path.parent / each) for name in names if (each := getattr(holder, name)) is not None}
 
     prepare = listed.prepare.model_copy(update=from_folder(listed.prepare, *CORRECTIONS))
-    in_file = ("patterns",) if listed.patterns is not None and listed.patterns.endswith(".json") else ()
+    in_file = ("patterns",) if listed.patterns is not None and names_file(listed.patterns) else ()
     return listed.model_copy(update={"prepare": prepare, **from_folder(listed, "ambient", *in_file)})
 
 
@@ -241,7 +246,9 @@ class FrameFacts(Options):
     list: FilePath | None = said(
         "list of facts about the capture; other options replace its entries", metavar="NAME|FILE", complete=LISTS
     )
-    patterns: str | None = said("patterns that were shown: a family, or a file patterns.json", metavar="NAME|FILE")
+    patterns: str | None = said(
+        "patterns that were shown: a family, own patterns, or a file patterns.json", metavar="NAME|FILE"
+    )
     camera: FilePath | None = said("camera: shipped name, or TOML file", metavar="NAME|FILE", complete=CAMERAS)
     exposure: float | None = said("exposure time of each frame [s]", metavar="SECONDS")
     calibration: FilePath | None = said("calibration folder of the same camera", metavar="CAL")

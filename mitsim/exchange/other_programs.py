@@ -308,11 +308,17 @@ def draw_family(
     ``closing`` adds a picture for the closing frame. Returns `patterns`, `n`, `pictures`, `projector` and `output`.
     MitsimError for an unknown family, or a projector of unknown or too few pixels.
     """
-    family = parse_patterns(name, n, seed)
+    known = load_model(locate(projector, "calibration", ".toml", PROJECTOR), ProjectorModel)
+    family = parse_patterns(name, n, seed, known.grey_light)
     patterns = Patterns.of(family, [frame_name(index) for index in range(len(family.shots))])
     where = grid_in(raster_of(projector), (n, n), f"projector {projector}")
+    shown: Iterable[npt.NDArray[Any]] = patterns_light(patterns, f"patterns {name}", closing)
+    if family.grey:  # by level, because the projector makes the light
+        levels = family.grey.levels
+        last = levels[:1] if closing == "first" else np.full((int(closing is not None), n, n), _WHITE)
+        shown = (each / _WHITE for each in chain(levels, last))
     with whole_folder(folder) as place:
-        count = draw(place, patterns_light(patterns, f"patterns {name}", closing), where, describe(patterns), closing)
+        count = draw(place, shown, where, describe(patterns), closing)
     return {"patterns": name, "n": n, "pictures": count, "projector": where, "output": str(folder)}
 
 

@@ -40,7 +40,7 @@ from mitsim.core.images import LEAST_RESPONSE, CommonFactor, Numbers, Preparer, 
 from mitsim.core.job import Cost, Limits
 from mitsim.core.picture_files import CORRECTIONS, Preparation, image_files
 from mitsim.core.runs import AMBIENT, CLOSING, TRUTH, frame_name, load_run
-from mitsim.devices.patterns import PatternFamily, parse_patterns, shot_orders
+from mitsim.devices.patterns import parse_patterns, shot_orders
 from mitsim.devices.sensor import PITCH_TOLERANCE
 from mitsim.exchange.capture_list import Electronics, RealCapture
 from mitsim.version import __version__
@@ -555,8 +555,7 @@ class _Plane:
             named = {key: data[key] for key in ("family", "n", "P_L", "P_R") if key in data}
             self.patterns = validate(manifests.Patterns, {**named, "captures": captures}, known.patterns)
         else:
-            left, right = (parse_patterns(known.patterns, side, known.listed.seed) for side in scene)
-            family = PatternFamily(known.patterns, left.left, right.right)
+            family = parse_patterns(known.patterns, (scene[0], scene[1]), known.listed.seed)
             self.patterns = manifests.Patterns.of(family, [frame_name(index) for index in range(len(family.shots))])
         sides = tuple(len(matrix) for matrix in self.patterns.matrices)
         if sides != scene:

@@ -27,7 +27,7 @@ from mitsim.core.configuration import Configuration, Positive, validate
 from mitsim.core.errors import ArgumentError, MitsimError, check_arguments
 from mitsim.core.files import PAIRS, read_json
 from mitsim.core.manifests import FORMAT as MODEL_FORMAT
-from mitsim.core.manifests import Digital, Plain
+from mitsim.core.manifests import Digital, Plain, Rows
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.seeds import integer, stream
 from mitsim.devices.patterns import Lighting, PatternFamily, parse_patterns
@@ -82,7 +82,9 @@ class PairsManifest(BaseModel):
     frames: int = Field(ge=1)
     """Frames of a pair, K: one a pattern, of a signed one the difference of two shots."""
     patterns: str
-    """Name of the family."""
+    """Name of the family, or path and SHA-256 of own patterns."""
+    own_patterns: tuple[Rows, Rows] | None = None
+    """Rows of P_L and of P_R, of own patterns."""
     exposure_s: float = Field(gt=0)
     """Seconds of a shot; where each pair is exposed for itself, the median."""
     camera: dict[str, Any]
@@ -126,6 +128,9 @@ class PairsManifest(BaseModel):
 
     @cached_property
     def family(self) -> PatternFamily:
+        if self.own_patterns is not None:
+            left, right = map(np.array, self.own_patterns)
+            return PatternFamily(self.patterns, left, right)
         return parse_patterns(self.patterns, self.n, self.seed)
 
 

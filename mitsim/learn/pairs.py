@@ -38,8 +38,9 @@ from mitsim.core.files import PAIRS, check_plain, output_folder, plain, write_js
 from mitsim.core.images import read_reflectance
 from mitsim.core.job import Cost
 from mitsim.core.manifests import other_request
+from mitsim.core.picture_files import picture_files
 from mitsim.core.seeds import integer, stream
-from mitsim.devices.patterns import PatternFamily
+from mitsim.devices.patterns import PatternFamily, is_own
 from mitsim.devices.sensor import digital_of
 from mitsim.devices.session import Drift
 from mitsim.learn.pair_store import (
@@ -53,7 +54,7 @@ from mitsim.learn.pair_store import (
     read_pairs_manifest,
     write_shard,
 )
-from mitsim.learn.requests import PairsRequest, picture_files
+from mitsim.learn.requests import PairsRequest
 from mitsim.light.cost_model import first_shadow, frames_cost
 from mitsim.light.light import SampledLight, traced_again
 from mitsim.light.passes import Simulation, emission
@@ -336,6 +337,7 @@ def make_pairs(bench: Bench, asked: PairsRequest, task: Task) -> tuple[PairStore
             m=bench.geometry.frame_shape,
             frames=sum(shot.sign != -1 for shot in family.shots),
             patterns=capture.patterns,
+            own_patterns=(family.left.tolist(), family.right.tolist()) if is_own(capture.patterns) else None,
             exposure_s=1.0,
             camera=plain(bench.identity()),
             sensor=json.dumps(bench.sensor.model_dump(exclude_none=True)),

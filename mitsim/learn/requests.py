@@ -11,7 +11,7 @@ from pydantic import AfterValidator, Field, field_validator
 from mitsim.bench.request import Exposure, Request, Seeded
 from mitsim.core.configuration import LIMITS, QUALITY, Configuration, FilePath, Options, load_model, option, validate
 from mitsim.core.errors import ArgumentError, MitsimError, near_name
-from mitsim.core.picture_files import PRINTS
+from mitsim.core.picture_files import picture_files
 from mitsim.devices.session import Drift
 
 # -------- Pairs
@@ -94,16 +94,6 @@ class PairsRequest(PairOptions):
             raise ArgumentError("vary", f"{vary.groups} groups of {self.count} pairs; give fewer groups or more pairs")
         if vary.exposure_fraction and capture.exposure != "auto":
             raise ArgumentError("exposure", f"{capture.exposure}: exposure_fraction varies; leave out one of both")
-
-
-def picture_files(folder: Path) -> tuple[Path, ...]:
-    """Return the pictures in a ``folder`` by their names; MitsimError if there are none."""
-    if not folder.is_dir():
-        raise MitsimError(f"pictures {folder}: is no folder; give one of pictures")
-    found = sorted(path for path in folder.iterdir() if path.suffix.lower() in PRINTS)
-    if not found:
-        raise MitsimError(f"pictures {folder}: holds no file that ends in {', '.join(PRINTS)}")
-    return tuple(found)
 
 
 # -------- Trainings

@@ -20,7 +20,7 @@ a^2). All coordinates are centred index coordinates in mm.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -393,6 +393,17 @@ def geometric_terms(shadow: ShadowGeometry, rows: Directions, columns: Direction
 
 def trapezoid_mean(profile: FloatArray, crossing: FloatArray, half_a: FloatArray, half_b: FloatArray) -> FloatArray:
     """Return the mean of the profile around each crossing over two boxes, in features; ``half_b`` may be 0."""
+    padded = np.concatenate(([0.0], profile, [0.0]))
+    total = np.zeros_like(crossing)
+    for feature, weight in trapezoid_weights(crossing, half_a, half_b, len(profile)):
+        total += padded[np.clip(feature + 1, 0, len(profile) + 1)] * weight
+    return total
+
+
+def trapezoid_weights(
+    crossing: FloatArray, half_a: FloatArray, half_b: FloatArray, features: int
+) -> Iterator[tuple[npt.NDArray[np.intp], FloatArray]]:
+    """Yield the feature around each crossing, and its weight in the mean over two boxes, until all are covered."""
     short, long = np.minimum(half_a, half_b), np.maximum(half_a, half_b)
 
     def below(x: FloatArray) -> FloatArray:
@@ -403,18 +414,16 @@ def trapezoid_mean(profile: FloatArray, crossing: FloatArray, half_a: FloatArray
         upper = np.where(distance <= long - short, 0.5 - distance / (2 * long), tail)
         return np.asarray(np.where(x < 0, upper, 1 - upper))
 
-    centre = crossing + len(profile) / 2
+    centre = crossing + features / 2
     reach = half_a + half_b
     first = np.floor(centre - reach)
     feature = np.clip(first, -(2**62), 2**62).astype(np.intp)
     offset = first - centre
-    padded = np.concatenate(([0.0], profile, [0.0]))
-    total, before = np.zeros_like(centre), np.zeros_like(centre)
+    before = np.zeros_like(centre)
     for step in range(int(np.ceil(2 * reach.max())) + 1):
         upto = below(offset + (step + 1))
-        total += padded[np.clip(feature + (step + 1), 0, len(profile) + 1)] * (upto - before)
+        yield feature + step, upto - before
         before = upto
-    return total
 
 
 def nodes_between(places: FloatArray, count: int) -> FloatArray:

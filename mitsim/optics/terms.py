@@ -211,7 +211,7 @@ def lacking(terms: SeparableTerms, left: FloatArray, right: FloatArray) -> Lacki
     for _ in range(_TURNS):
         rows, columns = (
             np.einsum("ij,ij->j", found, own) / np.maximum(np.einsum("ij,ij->j", own, own), np.finfo(np.float64).tiny)
-            for found, own in zip((left, right), _of_stripes(whole), strict=True)
+            for found, own in zip((left, right), stripe_term(whole), strict=True)
         )
         whole = [(rows * a, columns * b) for a, b in whole]
     values, split = _singular([*whole, (-left, right)])
@@ -222,7 +222,7 @@ def lacking(terms: SeparableTerms, left: FloatArray, right: FloatArray) -> Lacki
     return Lacking([split(number) for number in range(count)], float(beyond[0] / np.sqrt(energy)))
 
 
-def _of_stripes(terms: SeparableTerms) -> SeparableTerm:
+def stripe_term(terms: SeparableTerms) -> SeparableTerm:
     """Return the factors that stripes give of an operator (:mod:`mitsim.reconstruct.factors`).
 
     The uniform response sum_k (L_k 1) (R_k 1)^T splits into a v^T, and stripes h 1^T into u v^T with u = sum_k L_k h

@@ -238,6 +238,14 @@ def factor_energy(prepared: Prepared, patterns: Pair, noise: FactorNoise, image:
     return total
 
 
+def pattern_response(side: Side, factor: FloatArray, patterns: FloatArray) -> FloatArray:
+    """Return sum_i U_i^T L diag(p_i) (r, n): the data of each scene pixel's light through a ``factor`` L (m, n)."""
+    seen = np.zeros((len(side.singular), factor.shape[1]))
+    for slab, lit in zip(side.slabs, patterns.T, strict=True):
+        seen[slab.columns] += (slab.matrix.T @ factor) * lit
+    return seen
+
+
 def lacking_light(model: Model, terms: Sequence[SeparableTerm], image: FloatArray) -> tuple[FloatArray, float]:
     """Return the data (r, r') of an ``image`` by ``terms`` that the factors lack, and their energy beyond the range."""
     left, right = (lit @ lit.T for lit in model.patterns)
@@ -245,13 +253,8 @@ def lacking_light(model: Model, terms: Sequence[SeparableTerm], image: FloatArra
     for term in terms:
         for c, d in terms:
             energy += float(np.vdot(image, ((term[0].T @ c) * left) @ image @ ((d.T @ term[1]) * right)))
-        responses = []
-        for side, factor, patterns in zip(model.sides, term, model.patterns, strict=True):
-            seen = np.zeros((len(side.singular), factor.shape[1]))
-            for slab, lit in zip(side.slabs, patterns.T, strict=True):
-                seen[slab.columns] += (slab.matrix.T @ factor) * lit
-            responses.append(seen)
-        struck += responses[0] @ image @ responses[1].T
+        first, second = map(pattern_response, model.sides, term, model.patterns)
+        struck += first @ image @ second.T
     return struck, max(energy - float(np.square(struck).sum()), 0.0)
 
 

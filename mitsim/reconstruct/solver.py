@@ -37,7 +37,7 @@ factor in the same way.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
 from functools import cached_property, partial
@@ -468,20 +468,26 @@ def automatic_lambda(problem: DiagonalProblem, explained: bool = True) -> float:
     if problem.energy == 0:
         raise MitsimError("all frames are zero: lambda cannot be chosen; check exposure and black level")
 
-    def score(exponent: float) -> float:
-        return risk_score(problem, problem.scale * 10.0**exponent, noise)
-
-    best = int(np.argmin([score(exponent) for exponent in _EXPONENTS]))
-    lam = 0.0
-    if best > 0 or risk_score(problem, 0.0, noise) > score(_EXPONENTS[0]):
-        ends = _EXPONENTS[max(best - 1, 0)], _EXPONENTS[min(best + 1, len(_EXPONENTS) - 1)]
-        refined = minimize_scalar(score, bounds=ends, method="bounded", options={"xatol": 1e-3})
-        lam = float(problem.scale * 10.0 ** float(refined.x))
+    lam = best_lambda(lambda lam: risk_score(problem, lam, noise), problem.scale)
     if is_misfit(problem) or not explained:
         # Beyond the largest sigma^2 all goes to black, and at lambda 0 nothing moves, however large its noise.
         candidates = problem.scale * 10.0 ** _EXPONENTS[_EXPONENTS <= 0]
         lam = _steadiest(problem, [max(lam, candidates[0]), *candidates[candidates > max(lam, candidates[0])].tolist()])
     return max(lam, problem.least)
+
+
+def best_lambda(risk: Callable[[float], float], scale: float) -> float:
+    """Return the lambda, 0 or a part of ``scale``, of the least ``risk``."""
+
+    def score(exponent: float) -> float:
+        return risk(scale * 10.0**exponent)
+
+    best = int(np.argmin([score(exponent) for exponent in _EXPONENTS]))
+    if best == 0 and risk(0.0) <= score(_EXPONENTS[0]):
+        return 0.0
+    ends = _EXPONENTS[max(best - 1, 0)], _EXPONENTS[min(best + 1, len(_EXPONENTS) - 1)]
+    refined = minimize_scalar(score, bounds=ends, method="bounded", options={"xatol": 1e-3})
+    return float(scale * 10.0 ** float(refined.x))
 
 
 def end_of_range(problem: DiagonalProblem, lam: float) -> tuple[str, ...]:

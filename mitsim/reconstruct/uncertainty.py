@@ -282,18 +282,7 @@ class Propagation:
         return self._spread(np.full(self.gain.shape, variance))
 
     def of_frames(self, rows: FloatArray, columns: FloatArray) -> FloatArray:
-        left, right = self.model.sides
-        squares = [np.square(slab.matrix) for slab in right.slabs]
-        # Clipped at 0, rows and columns of frames that are darker than nothing have means of their own.
-        means = np.maximum(rows.mean(axis=2), columns.mean(axis=2))
-        means = np.where(means > 0, means, 1.0)
-        total = np.zeros_like(self.gain)
-        for slab, own_rows, own_columns, mean in zip(left.slabs, rows, columns, means, strict=True):
-            seen = np.zeros((len(own_columns), len(right.singular)))
-            for part, other, square, column in zip(seen, right.slabs, squares, own_columns, strict=True):
-                part[other.columns] = column @ square
-            total[slab.columns] += (own_rows @ np.square(slab.matrix)).T @ (seen / mean[:, None])
-        return self._spread(total)
+        return self._spread(frame_variances(self.model.sides, rows, columns))
 
     def of_ambient_frame(self, rows: FloatArray, columns: FloatArray) -> FloatArray:
         sides = zip(self.model.sides, (rows, columns), strict=True)
@@ -402,15 +391,37 @@ def uncertainty(data: Accumulation, solution: Solution, chi_square: float = 1.0)
     return Uncertainty({name: np.sqrt(np.maximum(each, 0.0)) for name, each in variances.items()}, factor)
 
 
-def _of_factor(own: Side, other: Side, patterns: FloatArray, terms: Pair, image: FloatArray) -> FloatArray:
-    seen = image @ other.response
-    # Pixels that the same patterns light are seen alike: coefficients answer to each kind of them once.
+def frame_variances(sides: tuple[Side, Side], rows: FloatArray, columns: FloatArray) -> FloatArray:
+    """Return the variance (r, r') of W by independent noise of frames (K, K'), from its means by row and column."""
+    left, right = sides
+    squares = [np.square(slab.matrix) for slab in right.slabs]
+    # Clipped at 0, rows and columns of frames that are darker than nothing have means of their own.
+    means = np.maximum(rows.mean(axis=2), columns.mean(axis=2))
+    means = np.where(means > 0, means, 1.0)
+    total = np.zeros((len(left.singular), len(right.singular)))
+    for slab, own_rows, own_columns, mean in zip(left.slabs, rows, columns, means, strict=True):
+        seen = np.zeros((len(own_columns), len(right.singular)))
+        for part, other, square, column in zip(seen, right.slabs, squares, own_columns, strict=True):
+            part[other.columns] = column @ square
+        total[slab.columns] += (own_rows @ np.square(slab.matrix)).T @ (seen / mean[:, None])
+    return total
+
+
+def kind_responses(own: Side, patterns: FloatArray) -> Pair:
+    """Return ||sum_i P[p, i] U_i[:, a]||^2 (r, kinds) by kind of pixel p, and the pixels (kinds, n) of each kind.
+
+    Pixels that the same patterns light are seen alike.
+    """
     kinds, kind = np.unique(patterns, axis=0, return_inverse=True)
     of_kind = (kind.ravel() == np.arange(len(kinds))[:, None]).astype(np.float64)
     stack = np.zeros((len(own.singular), own.pattern_count, own.sensor_size))
     for index, slab in enumerate(own.slabs):
         stack[slab.columns, index] = slab.matrix.T
-    responses = ((kinds @ (stack @ stack.transpose(0, 2, 1))) * kinds).sum(axis=2)
+    return ((kinds @ (stack @ stack.transpose(0, 2, 1))) * kinds).sum(axis=2), of_kind
+
+
+def _of_factor(own: Side, other: Side, patterns: FloatArray, terms: Pair, image: FloatArray) -> FloatArray:
+    seen, (responses, of_kind) = image @ other.response, kind_responses(own, patterns)
     rows, columns = terms
     parts = np.stack([(seen * column) @ other.basis.T for column in columns.T])
     spread = np.zeros((len(own.singular), len(other.basis)))

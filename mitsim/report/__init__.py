@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from mitsim.devices.patterns import FAMILIES
+from mitsim.devices.patterns import FAMILIES, is_own, short_name
 
 EQUAL_PEAK, EQUAL_FRAME, EQUAL_TOTAL = CONVENTIONS = ("equal peak", "equal frame", "equal total")
 """Exposures: see :mod:`mitsim.report.lit_scene`."""
@@ -12,6 +12,8 @@ IDEALISED, RENDERED = MODELS = ("idealised", "rendered")
 
 def label(name: str) -> str:
     """Return the usual name of the patterns ``name``: "49 dots" for ``dots:7``, "7 x 14 dots" for ``dots:7x14``."""
+    if is_own(name):
+        return short_name(name)
     kind, _, size = name.partition(":")
     count = size.replace("x", " x ") if "x" in size else size and str(int(size) ** 2)
     return f"{count} {FAMILIES[kind].label}" if count else kind.capitalize()
@@ -19,4 +21,4 @@ def label(name: str) -> str:
 
 def in_text(name: str) -> str:
     """Return the usual name of the patterns ``name`` inside a sentence: "uniform", "49 dots", "64 Hadamard"."""
-    return label(name)[:1].lower() + label(name)[1:]
+    return label(name) if is_own(name) else label(name)[:1].lower() + label(name)[1:]

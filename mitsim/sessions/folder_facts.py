@@ -23,6 +23,7 @@ _NEXT: Mapping[str, tuple[str, ...]] = {
     "image": ("mitsim compare {0} OTHER -o compared", *_MORE),
     "pairs": ("mitsim train unrolled {0} -o model.pt",),
     "session": ("mitsim run {0}/session.toml -o again",),
+    "design": ("mitsim capture SCENE --camera {0}/design/camera.toml -o run", "mitsim design {0}/goal.toml -o again"),
 }
 """Commands that take a folder, by the last word of its kind."""
 _NUMBERS = """scene=configuration.scene scene=scene camera=camera.sensor.name camera=camera patterns=patterns.family
@@ -30,7 +31,7 @@ projector=camera.projector.name patterns=patterns frames=patterns.captures frame
 exposure_s=digital.exposure_s error_at_most=total_error_bound monte_carlo_error=mc_error verdict=verdict study=study
 factor_error=result.phi_error separability_residual=result.separability_residual psnr_db=psnr ssim=ssim claims=claims
 delta_e=delta_e uncertainty=uncertainty chi_square=misfit.chi_square method=inputs.method lambda=lambda points=points
-missing=missing steps=steps run=made_of.run calibration=made_of.calibration"""
+missing=missing steps=steps masks=candidates run=made_of.run calibration=made_of.calibration"""
 """Main numbers as LABEL=KEY, with dotted keys of the JSON files of all kinds; a file has some of them."""
 _UNITS = {"exposure_s": "exposure [s]", "psnr_db": "PSNR [dB]", "ssim": "SSIM"}
 _OF_PARTS = "depths", colour_files.RUN, colour_files.CALIBRATION
@@ -88,7 +89,7 @@ def show(folder: Path | str) -> FolderFacts:
     Parameters
     ----------
     folder
-        Folder of any command: run, calibration, image, study, session, pairs, demo or characterised camera.
+        Folder of any command: run, calibration, image, study, session, pairs, demo, design or characterised camera.
 
     Raises
     ------

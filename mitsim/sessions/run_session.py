@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import BaseModel, Field
 
+from mitsim import verbs
 from mitsim.bench.request import NO, Exposure, Opening, Request, SessionRequest, Task
 from mitsim.core import files
 from mitsim.core.colour_files import MOSAIC, RUN, is_coloured, open_lines
@@ -26,6 +27,7 @@ from mitsim.core.errors import ArgumentError, MitsimError, cut
 from mitsim.core.headline import calibration_headline, each_once, frames_headline, headline, image_headline
 from mitsim.core.job import Job
 from mitsim.core.manifests import CalibrationManifest, RunManifest, read_manifest
+from mitsim.design.goal import Goal
 from mitsim.devices.framelist import load_chart
 from mitsim.devices.session import SessionRecipe, load_recipe
 from mitsim.exchange.formats import PNG, Exported, check_export, export
@@ -120,7 +122,7 @@ def run(
     job: Job | None = None,
     **options: Any,
 ) -> SessionResult:
-    """Run the steps of a session: capture, calibrate, reconstruct, study and export, each into its own folder.
+    """Run the steps of a session: capture, calibrate, reconstruct, study, design and export, each into its own folder.
 
     Parameters
     ----------
@@ -393,6 +395,13 @@ class _Steps:
         study = prepare_study(name, scene, self.folder / step.output, StudyOptions(**options), job)
         yield
         found = study()
+        return found.headline.partition(". Flagged")[0], found.warnings
+
+    def _design(self, step: session_file.Step) -> Work:
+        place, asked = self.folder / step.output, verbs.DesignOptions(resume=self.asked.resume)
+        work = verbs.prepare_design(Goal(**step.of(Goal)), place, asked)
+        yield
+        found = work(self.job.apart(f"{step.output} "))
         return found.headline.partition(". Flagged")[0], found.warnings
 
     def _export(self, step: session_file.Step) -> Work:

@@ -46,6 +46,8 @@ from mitsim.core.errors import (
 )
 from mitsim.core.files import PAGE, PICTURES, plain, read_json, resolve, write_text
 from mitsim.core.manifests import MANIFEST, CalibrationManifest, RunManifest, read_manifest
+from mitsim.design.goal import Goal
+from mitsim.devices.patterns import is_own
 from mitsim.devices.sensor import load_sensor
 from mitsim.devices.session import SessionRecipe, load_recipe
 from mitsim.exchange.formats import PNG, Exported, check_format
@@ -109,6 +111,10 @@ class _Study(_Placed, StudyOptions):
                 _one_value(f"over.{name}", value)
 
 
+class _Design(_Placed, Goal):
+    pass
+
+
 class _Export(Exported):
     run: FilePath | None = None
 
@@ -120,6 +126,7 @@ TABLES: dict[str, type[Options]] = {
     "calibrate": _Calibration,
     "reconstruct": _Image,
     "study": _Study,
+    "design": _Design,
     "export": _Export,
 }
 """Model of each table, in the order in which the steps are taken."""
@@ -345,11 +352,15 @@ def _change(data: dict[str, Any], name: str, value: Any, where: str) -> None:
 
 def _whole(table: str, key: str, value: Any, base: Path) -> Any:
     """Return the ``value`` of a field, as a whole path if it names a file from the folder ``base``."""
+    if isinstance(value, list):
+        return [_whole(table, key, each, base) for each in value]
     if not isinstance(value, str) or not value or "\0" in value or table not in TABLES:
         return value
     path, fields = Path(value), fields_of(table)
     if key not in fields:  # a parameter of the scene
         is_file = bool(path.suffix) and os.path.isfile(base / path)
+    elif key == "patterns":
+        is_file = is_own(value, base)
     elif not (key == "recipe" or "Path" in str(fields[key].annotation)) or key == "output":
         is_file = key == "method" and path.suffix == MODEL
     else:

@@ -18,7 +18,7 @@ PAPER = (
     "convolutional", "depth", "waterfall",
 )  # fmt: skip
 """Studies that `mitsim study all` puts on one page, in this order."""
-EXPERIMENTS = (*PAPER, "accuracy", "calibration", "colour", "drift", "learned", "sweep", "twin")
+EXPERIMENTS = (*PAPER, "accuracy", "calibration", "colour", "design", "drift", "learned", "sweep", "twin")
 """Studies of many points, whose modules have a ``STUDY``. The page of all lacks ``learned``, because it takes hours and
 needs torch."""
 SHARED = {

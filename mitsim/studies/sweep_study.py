@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from mitsim.core.configuration import locate
 from mitsim.core.errors import MitsimError
+from mitsim.devices.patterns import short_name
 from mitsim.report import EQUAL_PEAK, RENDERED
 from mitsim.studies.framework import experiment
 from mitsim.studies.framework.claims import distinct
@@ -64,7 +65,9 @@ def _axis(scope: experiment.Scope, knob: str) -> str:
 def _panels(results: experiment.Results) -> Mapping[str, Figure]:
     first, *others = knobs = _knobs(results)
     values = [(knob, each) for knob in knobs for each in distinct(results.frame, knob)]
-    names: dict[Any, str] = {(knob, each): f"{knob.removeprefix('asked_')} {each}" for knob, each in values}
+    names: dict[Any, str] = {
+        (knob, each): f"{knob.removeprefix('asked_')} {short_name(f'{each}')}" for knob, each in values
+    }
     seeds, bars = results.scope.seeds, _bars(results.scope)
     title = f"Images by {' and '.join(knobs)}{f', seed {seeds[0]}' if len(seeds) > 1 else ''}"
     panels: list[Panel] = [Images(first, title=title, down=("picture", *others), names=names | {None: ""})]
@@ -81,7 +84,7 @@ def _panels(results: experiment.Results) -> Mapping[str, Figure]:
 def _table(results: experiment.Results) -> Sequence[Part]:
     shown = {name: experiment.MEASURES[name] for name in results.scope.measures}
     columns = {column: f"{name.replace('_', '-')} {axis.rpartition(' ')[2]}" for name, (column, axis) in shown.items()}
-    names = {(knob, each): str(each) for knob in _knobs(results) for each in distinct(results.frame, knob)}
+    names = {(knob, each): short_name(str(each)) for knob in _knobs(results) for each in distinct(results.frame, knob)}
     bars = _bars(results.scope)
     title = f"Measures by setting{f': mean +- {bars}' if bars else ''}"
     table = Pivot(_knobs(results), columns=columns, title=title, names=names, interval=True)

@@ -23,6 +23,8 @@ from tests.system.refusals import NEW, Refused, mentions
         (["--patterns", "dots:x"], ["'x'", "whole number"]),
         (["--patterns", ""], ["''"]),
         (["--patterns", "hadamard:7"], ["order 7", "use 4 or 8"]),
+        (["--patterns", "nowhere.npy"], ["nowhere.npy: cannot be read", "check the path"]),
+        (["--patterns", "own.txt"], ["'own.txt'", "a file (.npy, .png"]),
         (["--exposure", "-1"], ["exposure -1", "to 1e+06"]),
         (["--exposure", "long"], ["'long'", "auto"]),
         (["--exposure-fraction", "1.5"], ["1.5", "to 1"]),

@@ -25,9 +25,9 @@ from tests.system.refusals import Call
 
 VERBS = ["demo", "run", "view", "plan", "capture", "calibrate", "reconstruct", "render", "study", "report", "doctor"]
 VERBS += ["characterise", "sense", "export", "import", "patterns", "transport", "list", "new", "pairs", "train"]
-VERBS += ["show", "compare"]
+VERBS += ["show", "compare", "predict", "design"]
 HIDDEN = {
-    "--variant": "characterise compare export import list new patterns reconstruct report sense show train",
+    "--variant": "characterise compare design export import list new patterns reconstruct report sense show train",
     "--overwrite": "characterise demo render sense study view",
 }
 """Verbs that accept an option without a line in their help, because it has no effect there."""
@@ -236,6 +236,52 @@ def test_pairs(call: Call, lab: Any, tmp_path: Path) -> None:
     assert sorted(path.name for path in (tmp_path / "pairs").iterdir()) == ["pairs.json", "pairs_00000.h5"]
     flagged = call("pairs", *lab.arguments, "-o", tmp_path / "bright", *options, "--exposure", "1000")
     assert flagged.code == 1 and "3 pairs are expected to fill the full well" in flagged.payload["warnings"][0]
+
+
+def test_design(call: Call, lab: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Interrupted between search and proof, and resumed. (Planted: the goal written before the search is checked;
+    design.json without a status; a resumed design of another goal; nothing moved aside.)"""
+    goal, out = tmp_path / "goal.toml", tmp_path / "out"
+    lines = [f'scene = "{lab.scene}"', f'camera = "{lab.camera}"', 'patterns = ["dots:4"]', "exposure_total_s = 1.0"]
+    lines += ["feature_um = [120.0]", "evaluations = 10", "starts = 1", "seeds = 2", "accuracy = 0.02"]
+    options = "--json", "--quiet", "-o", out
+
+    def asked(*more: str) -> Path:
+        goal.write_text("\n".join([*lines, *more]))
+        return goal
+
+    refused = call("design", asked("open_part = [0.0, 0.0]"), *options)
+    assert "open_part" in refused.refusal and not out.exists()
+
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr("mitsim.studies.mask_design.prove", interrupt)
+        assert call("design", asked(), *options).code == 130
+    begun = call("show", out, "--json", "--quiet")
+    assert begun.code == 1 and begun.payload["kind"] == "design" and not begun.payload["finished"]
+    kept = (out / "search.json").read_bytes()
+    for more, words in (((), "--overwrite"), (("--resume",), "another goal")):
+        line = call("design", asked("seed = 1"), *options, *more).refusal
+        assert words in line
+    found = call("design", asked(), *options, "--resume").payload
+    assert found.keys() == {
+        *("headline", "psnr", "candidates", "bounds", "sensitivity", "seconds_for_psnr", "complete", "seconds"),
+        *("output", "warnings"),
+    }
+    assert (out / "search.json").read_bytes() == kept and found["complete"] and found["seconds_for_psnr"] is None
+    keys = "name feature_um mask_distance_mm patterns origin code evaluations exposure_total_s psnr_of_search "
+    keys += "psnr_predicted causes psnr_rendered psnr_scatter session_exposure_s warnings"
+    for each in found["candidates"]:
+        assert each.keys() == {*keys.split()} and number(each["psnr_rendered"], 5, 60)
+        assert (out / each["name"].replace(" ", "_") / "camera.toml").is_file()
+    assert found["psnr"] == found["candidates"][0]["psnr_rendered"]
+    shown = call("show", out, "--json", "--quiet").payload
+    assert shown["finished"] and shown["numbers"]["masks"].startswith("4 (design, random")
+    (out / "mine.txt").write_text("kept if the command is refused")
+    assert "open_part" in call("design", asked("open_part = [0.0, 0.0]"), *options, "--overwrite").refusal
+    assert (out / "mine.txt").is_file() and (out / "report.html").is_file()
 
 
 def test_train(call: Call, lab: Any, tmp_path: Path) -> None:

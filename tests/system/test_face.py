@@ -51,7 +51,7 @@ import importlib, sys
 import mitsim as ms
 assert not {"numpy", "scipy", "mitsuba", "drjit", "pydantic"} & set(sys.modules), "the package alone imports nothing"
 assert set(ms._HOMES) == set(ms.__all__) and set(dir(ms)) == {*ms.__all__, "__version__"}
-tracing = ["CalibrationPlan", "Light", "Rendered", "calibrate_model", "plan_calibration"]
+tracing = ["CalibrationPlan", "Light", "Prediction", "Rendered", "calibrate_model", "plan_calibration"]
 for name in sorted(ms.__all__, key=tracing.__contains__):
     assert name in tracing or "mitsuba" not in sys.modules, "only what traces imports the renderer"
     home = importlib.import_module(ms._HOMES[name])

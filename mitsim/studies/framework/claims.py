@@ -18,7 +18,7 @@ from itertools import product
 from typing import TYPE_CHECKING, Any
 
 from mitsim.core.errors import MitsimError
-from mitsim.devices.patterns import FAMILIES
+from mitsim.devices.patterns import FAMILIES, is_own
 from mitsim.report import IDEALISED, RENDERED, in_text
 from mitsim.report.pages import Mean, round_to_error
 from mitsim.studies.framework.experiment import MEASURES, Claim, Results
@@ -154,7 +154,7 @@ def tally(claims: Sequence[Claim]) -> str:
 
 
 def value_name(column: str, value: Any, pattern_name: Callable[[str], str] = in_text) -> str:
-    if column == "patterns" and str(value).partition(":")[0] in FAMILIES:
+    if column == "patterns" and (is_own(str(value)) or str(value).partition(":")[0] in FAMILIES):
         return pattern_name(str(value))
     return f"{value:g}" if isinstance(value, float) else str(value).replace("_", " ")
 

@@ -118,6 +118,29 @@ def test_black_pixels_leak_into_frames_but_not_into_it(light: SampledLight) -> N
     assert sums[1] > 1.1 * sums[0]
 
 
+def test_frames_of_grey_pictures_are_sums_of_single_pixels(light: SampledLight, tmp_path: Path) -> None:
+    """Each pixel shines between black and white by the tone curve; lamps shine once.
+
+    (Planted: the tone curve left out; black added to grey pixels in place of mixed.)
+    """
+    devices = {"contrast_ratio": 20.0, "tone_curve": 2.2}
+    bench = replace(
+        light.bench, devices=replace(light.bench.devices, projector=light.bench.projector.model_copy(update=devices))
+    )
+    settings = replace(light.plan.settings, effects=light.plan.settings.effects | {"black-level"})
+    leaky = replace(light, simulation=Simulation(bench, settings))
+    levels = np.rint(np.outer(np.linspace(0, 255, N), np.linspace(0.2, 1, N))).astype(np.uint8)
+    np.save(tmp_path / "grey.npy", levels)
+    (shown,) = leaky.frames(bench.family(str(tmp_path / "grey.npy")).lighting, 2)
+    single = leaky.frames(parse_patterns(f"dots:{N}", N).lighting, 2)
+    off, black = single.projector_off.irradiance, 0.05
+    white = next(iter(leaky.frames(parse_patterns("uniform", N).lighting, 2))).irradiance - off
+    expected = off + black * white
+    for level, frame in zip(levels.ravel().tolist(), single, strict=True):
+        expected = expected + (level / 255) ** 2.2 * (frame.irradiance - off - black * white)
+    assert shown.irradiance == pytest.approx(expected, rel=1e-5)
+
+
 def test_its_noise_is_what_it_says(light: SampledLight, captured: Capture) -> None:
     """Mean residual over 4096 pixels of 16 shots, in units of its deviation: normal to five of it.
 

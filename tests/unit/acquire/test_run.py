@@ -73,6 +73,23 @@ def test_the_folder_holds_every_frame_and_nothing_else(captured: Capture) -> Non
     assert summary["variant"] == "llvm_ad_mono"
 
 
+def test_own_patterns_that_equal_a_family_give_its_frames(bench: Bench, captured: Capture, tmp_path: Path) -> None:
+    """To the last bit; the manifest has their file's name, SHA-256 and factors. Changed, they are not resumed.
+
+    (Planted: pictures upside down; a SHA-256 that is not stated.)
+    """
+    family, path = parse_patterns("dots:3", N), tmp_path / "own.npy"
+    np.save(path, np.stack([family.light(shot) for shot in family.shots]))
+    run = bench.capture(str(path), tmp_path / "run", accuracy=ACCURACY, seed=5)
+    assert pixels(run.folder) == pixels(captured.folder)
+    stated, ours = run.manifest.patterns, captured.manifest.patterns
+    assert (stated.family, stated.P_L, stated.P_R, stated.captures) == ("own.npy", ours.P_L, ours.P_R, ours.captures)
+    assert run.manifest.configuration["patterns"] == f"{path}#{checksum(path)}"
+    np.save(path, np.ones((9, N, N)))
+    with pytest.raises(MitsimError, match="patterns"):
+        bench.capture(str(path), tmp_path / "run", accuracy=ACCURACY, seed=5, resume=True)
+
+
 def test_the_monte_carlo_error_is_within_the_accuracy(captured: Capture, bench: Bench) -> None:
     """Stated, and true: against light of another seed at a third of the error."""
     assert 0 < captured.manifest.mc_error <= ACCURACY and not captured.warnings

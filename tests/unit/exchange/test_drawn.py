@@ -99,6 +99,21 @@ def test_a_family_is_drawn_shot_by_shot(devices: tuple[str, str], tmp_path: Path
         ]
 
 
+def test_own_grey_pictures_are_drawn_by_level_and_described_by_light(tmp_path: Path) -> None:
+    """(Planted: light drawn in place of levels; a linear tone curve.)"""
+    levels, projector = np.arange(256).reshape(16, 16).astype(np.uint8), tmp_path / "projector.toml"
+    levels = np.rint(np.outer(levels[:, 15], levels[15] / 255)).astype(np.uint8)
+    np.save(tmp_path / "own.npy", levels)
+    projector.write_text(f"{PROJECTOR}tone_curve = 2.0\n".replace("30", "16").replace("14", "16"))
+    draw_family(tmp_path / "drawn", str(tmp_path / "own.npy"), 16, str(projector), closing="uniform")
+    for name, expected in (("pattern_00000", levels), ("pattern_00001", np.full((16, 16), 255))):
+        with Image.open(tmp_path / "drawn" / "patterns" / f"{name}.png") as picture:
+            assert np.array_equal(np.asarray(picture), expected)
+    described = json.loads((tmp_path / "drawn" / "patterns.json").read_text())
+    product = np.outer(described["P_L"], described["P_R"])
+    assert np.abs(255 * np.sqrt(product) - levels).max() < 1
+
+
 def test_a_cell_is_square_on_the_scene_where_pixels_are_not(tmp_path: Path) -> None:
     """Of the MP-CL1, 1920 x 720 pixels in a picture of 16:9: the lit part is as wide as high, and so is every cell.
     (Planted: the aspect left out; its inverse.)"""

@@ -117,12 +117,15 @@ def test_names_of_others_are_refused(write: Callable[[str], Path], output: str) 
 
 
 def test_paths_are_written_as_seen_from_the_file(write: Callable[[str], Path], tmp_path: Path) -> None:
-    """And read again from there; a bare name is no shipped one. (Planted: `photograph` for `./photograph`.)"""
+    """And read again from there; a bare name is no shipped one. (Planted: `photograph` for `./photograph`; own patterns
+    seen from the working folder.)"""
     (tmp_path / "s").mkdir()
-    for name in ("photograph", "s/camera.toml"):
+    for name in ("photograph", "s/camera.toml", "s/own.npy"):
         (tmp_path / name).touch()
     tables = {
         "scene": {"scene": str(tmp_path / "s" / "photograph"), "camera": str(tmp_path / "s" / "camera.toml")},
+        "capture": {"patterns": str(tmp_path / "s" / "own.npy")},
+        "design": {"scene": "cards", "exposure_total_s": 1.0, "patterns": [str(tmp_path / "s" / "own.npy"), "dots:3"]},
         "reconstruct": [{"run": str(tmp_path / "run"), "calibration": "/elsewhere/cal"}],
     }
     text = session_text(tables, tmp_path / "s")
@@ -213,6 +216,7 @@ def test_nothing_is_written_where_a_step_would_be_refused(write: Callable[[str],
         ("[capture]\n[calibrate]\nrecipe = 'none.toml'\n[reconstruct]\ncalibration = './no'\n", "has 2 mistakes"),
         ("[capture]\n[calibrate]\n[reconstruct]\nchart = 'nosuch'\n", "the frames are not coloured"),
         ("[capture]\npatterns = 'dots:200'\n", "dots:200"),
+        ("[design]\nscene = 'photograph'\nexposure_total_s = 1.0\npatterns = ['dots:500']\n", "K is 500"),
         ("[capture]\ncolour = 'mosaic'\n", "has no mosaic of colour filters"),
     ):
         with pytest.raises(ms.MitsimError) as refused:

@@ -1,0 +1,146 @@
+"""Expected squared error of images of a separable camera by cause, with gradients, from Gram matrices.
+
+A side of the camera has the factor F (m, n) and the patterns C (n, k). Frames depend on F and C only through the stack
+of F diag(c_i), whose Gram matrix is M = (F^T F) o (C C^T) = V diag(mu) V^T. With M and nu of the two sides, Tikhonov
+regularisation gives the coefficient (a, b) of the image the gain G_ab = sqrt(mu_a nu_b) / (mu_a nu_b + lambda). The
+expected squared error of all causes that are independent of one another is
+
+    sum over causes of  w sum_ab  mu_a^i nu_b^j / (mu_a nu_b + lambda)^2  (v_a^T A v_a) (v'_b^T B v'_b)
+
+where the exponents (i, j), the weight w and the matrices A and B depend on the cause:
+
+- noise of variance w in all data: (1, 1), A = B = 1.
+- *regularisation bias* of a scene of covariance A (x) B: (0, 0), w = lambda^2.
+- errors of variance w in all numbers of the left factor, which are the same in all frames: (0, 2),
+  A = (F^T F) o (P P) with P = C C^T, and B = E[x x^T] of the scene's rows.
+- *detail* inside projector pixels, of the deviation F' S F'^T: (0, 2), A = N S N^T with N = (F^T F') o P.
+- a frame of noise that is subtracted from all frames: (0, 0), A = (F^T F) o (c c^T) with c the sum of patterns.
+
+Because M alone determines mu and V, the sum is a spectral function of M. Its derivative needs divided differences of
+mu^i / (mu nu + lambda)^2 (Daleckii and Krein, 1965), which are written without a difference of close numbers, so that
+equal eigenvalues are harmless (Lewis, Math. Oper. Res. 21, 576, 1996).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import minimize_scalar
+
+from mitsim.core.arrays import FloatArray
+
+Pair = tuple[FloatArray, FloatArray]
+_DECADES = -14.0, 2.0
+"""Range of lambda relative to the largest squared singular value, as powers of ten."""
+
+
+@dataclass(frozen=True, eq=False)
+class Cause:
+    """One cause of error: ``powers`` (i, j), matrices A and B (n, n), weight w, and ``bias`` if w is lambda^2."""
+
+    name: str
+    powers: tuple[int, int]
+    matrices: Pair
+    weight: float = 1.0
+    bias: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class ExpectedError:
+    """Sum of squared errors (``total``, and ``parts`` by cause) at ``lam``, and its derivatives.
+
+    ``per_weight`` has the sum of each cause for a weight of 1. ``of_gram`` is the derivative with respect to M of each
+    side, and ``of_matrices`` those with respect to A and B of each cause; empty without gradients.
+    """
+
+    lam: float
+    parts: dict[str, float]
+    per_weight: tuple[float, ...]
+    of_gram: tuple[FloatArray, ...] = ()
+    of_matrices: tuple[Pair, ...] = ()
+
+    @property
+    def total(self) -> float:
+        return sum(self.parts.values())
+
+
+def expected_error(
+    grams: Pair, causes: Sequence[Cause], lam: float | None = None, slopes: bool = False
+) -> ExpectedError:
+    """Compute the expected squared error of an image, summed over its pixels.
+
+    Parameters
+    ----------
+    grams
+        M of the left and of the right side, (n, n) and (n', n').
+    causes
+        Causes of error.
+    lam
+        Regularisation; None for the value with the least error.
+    slopes
+        Compute derivatives. At the best lambda, its own change does not contribute (envelope theorem).
+    """
+    mu, left = np.linalg.eigh(grams[0])
+    nu, right = (mu, left) if grams[1] is grams[0] else np.linalg.eigh(grams[1])
+    mu, nu = np.maximum(mu, 0.0), np.maximum(nu, 0.0)
+    products = dict[tuple[int, int], FloatArray]()  # causes share matrices
+
+    def times(matrix: FloatArray, basis: FloatArray) -> FloatArray:
+        key = id(matrix), id(basis)
+        if key not in products:
+            products[key] = matrix @ basis
+        return products[key]
+
+    turned = [(times(a, left), times(b, right)) for a, b in (cause.matrices for cause in causes)]
+    seen = [((left * a).sum(axis=0), (right * b).sum(axis=0)) for a, b in turned]
+
+    def sums(value: float) -> list[float]:
+        inverse = 1 / np.square(np.outer(mu, nu) + value)
+        scales = (value**2 if cause.bias else 1.0 for cause in causes)
+        both = zip(causes, seen, scales, strict=True)
+        return [
+            scale * float((a * mu ** each.powers[0]) @ inverse @ (b * nu ** each.powers[1]))
+            for each, (a, b), scale in both
+        ]
+
+    weights = [cause.weight for cause in causes]
+    if lam is None:
+        largest = float(mu[-1] * nu[-1])
+        trial = minimize_scalar(
+            lambda power: float(np.dot(weights, sums(largest * 10.0**power))), bounds=_DECADES, method="bounded",
+            options={"xatol": 1e-3},
+        )  # fmt: skip
+        lam = largest * 10.0 ** float(trial.x)
+    found, parts = tuple(sums(lam)), dict.fromkeys((cause.name for cause in causes), 0.0)
+    for cause, one in zip(causes, found, strict=True):
+        parts[cause.name] += cause.weight * one
+    if not slopes:
+        return ExpectedError(lam, parts, found)
+    of_left, of_right = np.zeros_like(grams[0]), np.zeros_like(grams[1])
+    matrices = []
+    for cause, (a, b), (own, other) in zip(causes, turned, seen, strict=True):
+        (i, j), weight = cause.powers, cause.weight * (lam**2 if cause.bias else 1.0)
+        by_left, by_right = other * nu**j, own * mu**i
+        of_left += weight * (left.T @ a) * _divided(mu, nu, lam, i, by_left)
+        of_right += weight * (right.T @ b) * _divided(nu, mu, lam, j, by_right)
+        inverse = 1 / np.square(np.outer(mu, nu) + lam)
+        gains = weight * mu**i * (inverse @ by_left), weight * nu**j * (by_right @ inverse)
+        matrices.append(((left * gains[0]) @ left.T, (right * gains[1]) @ right.T))
+    return ExpectedError(lam, parts, found, (left @ of_left @ left.T, right @ of_right @ right.T), tuple(matrices))
+
+
+def _divided(mu: FloatArray, nu: FloatArray, lam: float, power: int, weights: FloatArray) -> FloatArray:
+    """Return divided differences (n, n) of g(mu) = sum_b w_b mu^i / (mu nu_b + lambda)^2 between all eigenvalues."""
+    once = 1 / (np.outer(mu, nu) + lam)
+    twice = np.square(once)
+    if power == 0:
+        one = (once * (weights * nu)) @ twice.T
+        return np.asarray(-(one + one.T))
+    if power == 1:
+        scaled = mu[:, None] * twice
+        return np.asarray(lam**2 * (twice * weights) @ twice.T - (scaled * (weights * np.square(nu))) @ scaled.T)
+    one = mu[:, None] * ((twice * weights) @ twice.T)
+    scaled = mu[:, None] * twice
+    return np.asarray(lam * (2 * (scaled * (weights * nu)) @ scaled.T + lam * (one + one.T)))

@@ -1,0 +1,80 @@
+"""The design study: its points, rows of one point on a small scene, and claims of invented results."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mitsim.report import RENDERED
+from mitsim.studies.design_study import MASKS, PREDICTED
+from mitsim.studies.framework.experiment import TRUTH, Point, Results, Scope, Setup, find_experiment
+from mitsim.studies.framework.studio import Studio
+
+STUDY = find_experiment("design")
+
+
+def test_points_are_all_doses_and_frames_with_three_seeds() -> None:
+    whole, few, own = (
+        STUDY.points(Scope(Setup(camera=camera), ("page",), seeds=(4,), quick=quick))
+        for camera, quick in ((None, False), (None, True), ("imx250", True))
+    )
+    assert len({point.key for point in whole}) == len(whole) == 6 * 4 * 3 and len(few) == 3 * 3
+    assert {point["seed"] for point in few} == {4, 5, 6}
+    assert [points[0].setup.camera for points in (whole, few, own)] == [None, "small", "imx250"]
+    assert {(point.setup.picture, point.setup.accuracy) for point in whole} == {(None, 3e-4)}
+
+
+def test_a_point_has_each_mask_predicted_and_rendered(shared_scene: Callable[..., Path], variant: str) -> None:
+    y, x = np.mgrid[:32, :32] / 32
+    print_ = np.rint(125 + 100 * np.sin(7 * y + 2 * x) * np.cos(9 * x)).astype(int)
+    setup = Setup(str(shared_scene("design", reflectance=print_)), variant=variant, accuracy=1e-2)
+    point = Point.of(setup, patterns="dots:4", dose=0.1, evaluations=10, seed=1)
+    with Studio() as studio:
+        found = STUDY.measure(studio, point)
+        full = studio.bench(setup).predict("dots:4")
+    rows: dict[tuple[Any, Any], Any] = {(row["mask"], row["model"]): row for row in found.rows}
+    assert [*rows] == [(mask, model) for model in (PREDICTED, RENDERED) for mask in MASKS]
+    for model in (PREDICTED, RENDERED):
+        level, *simple = (rows[mask, model]["psnr_db"] for mask in MASKS)
+        assert rows["design", model]["gain_db"] == pytest.approx(level - max(simple))
+    for mask in MASKS:
+        row = rows[mask, RENDERED]
+        assert row["off_db"] == pytest.approx(row["psnr_db"] - rows[mask, PREDICTED]["psnr_db"])
+        assert row["exposure_total_s"] == pytest.approx(0.1 * 16 * full.exposure_s) and row["frames"] == 16
+    assert {*found.arrays} == {*MASKS, TRUTH}
+
+
+@pytest.mark.parametrize(
+    ("bright", "off", "verdicts"),
+    [
+        ({}, {}, ["confirmed"] * 4),
+        ({"design": 47.0, "pinholes": 46.2}, {}, ["confirmed", "not confirmed", "not confirmed", "confirmed"]),
+        ({}, {("dots:7", 0.1, "random"): -0.8}, ["confirmed", "confirmed", "confirmed", "not confirmed"]),
+    ],
+)
+def test_claims(bright: dict[str, float], off: dict[tuple[str, float, str], float], verdicts: list[str]) -> None:
+    levels = {
+        ("dots:7", 1.0): dict(zip(MASKS, (56.0, 55.4, 56.1, 51.4), strict=True)) | bright,
+        ("dots:7", 0.1): dict(zip(MASKS, (48.5, 46.5, 45.9, 44.8), strict=True)),
+        ("dots:3", 0.1): dict(zip(MASKS, (26.0, 25.9, 25.8, 25.0), strict=True)),
+    }
+    rows = [
+        {"patterns": patterns, "frames": 49 if patterns == "dots:7" else 9, "dose": dose, "seed": seed, "mask": mask,
+         "model": model, "psnr_db": level + 0.01 * seed + (missed if model == RENDERED else 0),
+         "gain_db": 2.0 + 0.01 * seed if mask == "design" else None, "off_db": missed if model == RENDERED else None,
+         "case": f"{mask}, {patterns}, {dose}"}
+        for (patterns, dose), masks in levels.items()
+        for mask, level in masks.items()
+        for missed in [off.get((patterns, dose, mask), 0.0)]
+        for model in (PREDICTED, RENDERED)
+        for seed in range(3)
+    ]  # fmt: skip
+    results = Results(rows)
+    assert [claim.verdict for claim in STUDY.judge(results)] == verdicts
+    assert {*STUDY.draw(results)} == {"gain_by_dose.png", "gain_by_frames.png", "masks.png"}
+    (table,) = STUDY.parts(results)
+    assert table.head[1:3] == ("design, predicted", "design, rendered") and table.rows[0][0] == "49 frames, dose 1"
