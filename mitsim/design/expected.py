@@ -10,11 +10,12 @@ expected squared error of all causes that are independent of one another is
 where the exponents (i, j), the weight w and the matrices A and B depend on the cause:
 
 - noise of variance w in all data: (1, 1), A = B = 1.
-- *regularisation bias* of a scene of covariance A (x) B: (0, 0), w = lambda^2.
 - errors of variance w in all numbers of the left factor, which are the same in all frames: (0, 2),
   A = (F^T F) o (P P) with P = C C^T, and B = E[x x^T] of the scene's rows.
 - *detail* inside projector pixels, of the deviation F' S F'^T: (0, 2), A = N S N^T with N = (F^T F') o P.
 - a frame of noise that is subtracted from all frames: (0, 0), A = (F^T F) o (c c^T) with c the sum of patterns.
+
+*Regularisation* removes lambda z_ab / (mu_a nu_b + lambda) of each coefficient z = V^T X V' of a scene X.
 
 Because M alone determines mu and V, the sum is a spectral function of M. Its derivative needs divided differences of
 mu^i / (mu nu + lambda)^2 (Daleckii and Krein, 1965), which are written without a difference of close numbers, so that
@@ -32,19 +33,19 @@ from scipy.optimize import minimize_scalar
 from mitsim.core.arrays import FloatArray
 
 Pair = tuple[FloatArray, FloatArray]
+BIAS = "regularisation_bias"
 _DECADES = -14.0, 2.0
 """Range of lambda relative to the largest squared singular value, as powers of ten."""
 
 
 @dataclass(frozen=True, eq=False)
 class Cause:
-    """One cause of error: ``powers`` (i, j), matrices A and B (n, n), weight w, and ``bias`` if w is lambda^2."""
+    """One cause of error: ``powers`` (i, j), matrices A and B (n, n), and weight w."""
 
     name: str
     powers: tuple[int, int]
     matrices: Pair
     weight: float = 1.0
-    bias: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +68,7 @@ class ExpectedError:
 
 
 def expected_error(
-    grams: Pair, causes: Sequence[Cause], lam: float | None = None, slopes: bool = False
+    grams: Pair, causes: Sequence[Cause], scenes: Sequence[FloatArray], lam: float | None = None, slopes: bool = False
 ) -> ExpectedError:
     """Compute the expected squared error of an image, summed over its pixels.
 
@@ -77,6 +78,8 @@ def expected_error(
         M of the left and of the right side, (n, n) and (n', n').
     causes
         Causes of error.
+    scenes
+        Scenes (n, n') over which the bias of regularisation is averaged.
     lam
         Regularisation; None for the value with the least error.
     slopes
@@ -96,16 +99,16 @@ def expected_error(
     turned = [(times(a, left), times(b, right)) for a, b in (cause.matrices for cause in causes)]
     seen = [((left * a).sum(axis=0), (right * b).sum(axis=0)) for a, b in turned]
 
+    coefficients = [left.T @ scene @ right for scene in scenes]
+    energy = sum(np.square(each) for each in coefficients) / len(scenes)
+
     def sums(value: float) -> list[float]:
         inverse = 1 / np.square(np.outer(mu, nu) + value)
-        scales = (value**2 if cause.bias else 1.0 for cause in causes)
-        both = zip(causes, seen, scales, strict=True)
-        return [
-            scale * float((a * mu ** each.powers[0]) @ inverse @ (b * nu ** each.powers[1]))
-            for each, (a, b), scale in both
-        ]
+        both = zip((cause.powers for cause in causes), seen, strict=True)
+        found = [float((a * mu**i) @ inverse @ (b * nu**j)) for (i, j), (a, b) in both]
+        return [*found, value**2 * float(np.vdot(inverse, energy))]
 
-    weights = [cause.weight for cause in causes]
+    weights = [*(cause.weight for cause in causes), 1.0]
     if lam is None:
         largest = float(mu[-1] * nu[-1])
         trial = minimize_scalar(
@@ -113,19 +116,25 @@ def expected_error(
             options={"xatol": 1e-3},
         )  # fmt: skip
         lam = largest * 10.0 ** float(trial.x)
-    found, parts = tuple(sums(lam)), dict.fromkeys((cause.name for cause in causes), 0.0)
-    for cause, one in zip(causes, found, strict=True):
+    found = tuple(sums(lam))
+    parts = {**dict.fromkeys((cause.name for cause in causes), 0.0), BIAS: found[-1]}
+    for cause, one in zip(causes, found[:-1], strict=True):
         parts[cause.name] += cause.weight * one
     if not slopes:
         return ExpectedError(lam, parts, found)
+    once = 1 / (np.outer(mu, nu) + lam)
+    inverse, matrices = np.square(once), []
     of_left, of_right = np.zeros_like(grams[0]), np.zeros_like(grams[1])
-    matrices = []
+    for each in coefficients:
+        rows = (each * once * nu) @ (each * inverse).T
+        columns = (each * once * mu[:, None]).T @ (each * inverse)
+        of_left -= lam**2 / len(scenes) * (rows + rows.T)
+        of_right -= lam**2 / len(scenes) * (columns + columns.T)
     for cause, (a, b), (own, other) in zip(causes, turned, seen, strict=True):
-        (i, j), weight = cause.powers, cause.weight * (lam**2 if cause.bias else 1.0)
+        (i, j), weight = cause.powers, cause.weight
         by_left, by_right = other * nu**j, own * mu**i
         of_left += weight * (left.T @ a) * _divided(mu, nu, lam, i, by_left)
         of_right += weight * (right.T @ b) * _divided(nu, mu, lam, j, by_right)
-        inverse = 1 / np.square(np.outer(mu, nu) + lam)
         gains = weight * mu**i * (inverse @ by_left), weight * nu**j * (by_right @ inverse)
         matrices.append(((left * gains[0]) @ left.T, (right * gains[1]) @ right.T))
     return ExpectedError(lam, parts, found, (left @ of_left @ left.T, right @ of_right @ right.T), tuple(matrices))

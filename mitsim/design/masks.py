@@ -138,6 +138,7 @@ def objectives(stand: Stand, goal: Goal, choice: Choice, session_s: float) -> li
     """Return the objectives of a ``choice``, one for each dose and distance."""
     bench, sensor = stand.bench, stand.bench.sensor
     family, prior = choice.family(bench), prior_of(stand, goal)
+    scenes = [stand.truth] if goal.prior is None else prior.draw(stand.truth.shape, goal.seed)
     if family.signed:
         problem = f"patterns: got {choice.patterns!r}, which are differences of two frames, and a search knows single"
         raise MitsimError(f"goal: {problem} ones; give uniform, dots:K, random:K or own patterns")
@@ -171,7 +172,7 @@ def objectives(stand: Stand, goal: Goal, choice: Choice, session_s: float) -> li
                 board=1.0,
                 most_e=_FULL * sensor.superpixel_full_well_e,
             )
-            found.append(Objective((rows, columns), light, prior))
+            found.append(Objective((rows, columns), light, prior, scenes))
     if goal.exposures == "light":
         code = Search(found).maximum_length().code
         found = [each.of_equal_light((code, code)) for each in found]

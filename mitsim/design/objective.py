@@ -22,6 +22,7 @@ from scipy.sparse import csr_array
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
+from mitsim.core.seeds import stream
 from mitsim.design.expected import Cause, expected_error
 from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.projector import Spectrum
@@ -35,6 +36,8 @@ _CELLS = 16
 """Grid cells in sqrt(lambda D)."""
 _BRIGHT = 0.5
 """Standard deviations by which the scene about the brightest pixel of a frame is brighter than its mean."""
+_SCENES = 4
+"""Scenes that stand for a prior."""
 _STEP = 0.25
 """Part of a projector pixel by which directions move for a derivative."""
 
@@ -49,6 +52,12 @@ class Prior:
 
     def covariance(self, n: int) -> FloatArray:
         return self.correlation ** np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
+
+    def draw(self, shape: tuple[int, int], seed: int) -> list[FloatArray]:
+        """Return scenes of the prior: their bias scatters by some hundredths, because they have many coefficients."""
+        random, roots = stream(seed, "prior"), [np.linalg.cholesky(self.covariance(n)) for n in shape]
+        normal = random.standard_normal((_SCENES, *shape))
+        return [self.mean + self.deviation * roots[0] @ each @ roots[1].T for each in normal]
 
 
 @dataclass(frozen=True)
@@ -208,11 +217,15 @@ class _Stack:
 
 @dataclass(frozen=True, eq=False)
 class Objective:
-    """Expected mean squared error of images of scenes of a ``prior``, as a function of the codes of both sides."""
+    """Expected mean squared error of images as a function of the codes of both sides.
+
+    Regularisation acts on ``scenes``; other causes need the mean and covariance of a ``prior`` alone.
+    """
 
     sides: tuple[CodedSide, CodedSide]
     light: Light
     prior: Prior
+    scenes: Sequence[FloatArray]
 
     @cached_property
     def _covariances(self) -> tuple[FloatArray, FloatArray]:
@@ -282,14 +295,12 @@ class Objective:
         causes = [
             Cause("dark_and_read_noise", (1, 1), (ones[0], ones[1]), noise),
             Cause("shot_noise", (0, 0), (stacks[0].shot, stacks[1].shot), prior.mean / electrons),
-            Cause("regularisation_bias", (0, 0), (even[0], even[1]), prior.mean**2, bias=True),
-            Cause("regularisation_bias", (0, 0), covariances, prior.deviation**2, bias=True),
             Cause("calibration_noise", (0, 2), (stacks[0].reused, second[1]), errors[0]),
             Cause("calibration_noise", (2, 0), (second[0], stacks[1].reused), errors[1]),
             Cause("print_detail", (0, 2), (stacks[0].inside, covariances[1]), moment),
             Cause("print_detail", (2, 0), (covariances[0], stacks[1].inside), moment),
         ]
-        found = expected_error((grams[0], grams[1]), causes, lam, slopes)
+        found = expected_error((grams[0], grams[1]), causes, self.scenes, lam, slopes)
         pixels = grams[0].shape[0] * grams[1].shape[0]
         value = Value({name: part / pixels for name, part in found.parts.items()}, found.lam)
         if not slopes:
@@ -300,8 +311,8 @@ class Objective:
             stack = stacks[own]
             side, factor, moved = sides[own], factors[own], stack.factor.moved
             of = found.of_matrices
-            by_cross = found.of_gram[own] * side.gram + of[4 + own][own] * side.squared
-            by_detail = 2 * of[6 + own][own] @ stack.detail * side.gram
+            by_cross = found.of_gram[own] * side.gram + of[2 + own][own] * side.squared
+            by_detail = 2 * of[4 + own][own] @ stack.detail * side.gram
             by_factor = 2 * factor @ by_cross + moved @ by_detail.T
             by_derivative = factor @ by_detail
             for pattern, light_of in zip(side.patterns.T, stack.bright.T, strict=True):
@@ -311,10 +322,10 @@ class Objective:
             if exposed is not None:
                 by_exposure = by_weight[0] * (noise + (light.read_noise_e / electrons) ** 2)
                 by_factor -= (by_exposure + by_weight[1] * prior.mean / electrons) * exposed[own]
-            by_response = sum(by_weight[4 + k] * errors[k] for k in (0, 1)) / response
+            by_response = sum(by_weight[2 + k] * errors[k] for k in (0, 1)) / response
             by_factor += by_response * (2 if light.pairs else 1) * light.board / 2 / session * full[other] / rows
             # The error of the other factor falls with the norm of this side's common response.
-            by_factor += (-2 * by_weight[4 + other] * errors[other] / norms[own]) * common[own][:, None]
+            by_factor += (-2 * by_weight[2 + other] * errors[other] / norms[own]) * common[own][:, None]
             gradients.append(stack.factor.back(by_factor, by_derivative) / pixels)
         return Value(value.parts, found.lam, (gradients[0], gradients[1]))
 

@@ -25,6 +25,7 @@ LINES = Spectrum(np.array([640.0, 520.0]), np.array([0.6, 0.4]))
 DOTS = (np.arange(N)[:, None] % 4 == np.arange(4)).astype(np.float64)
 LIGHT = Light(gain=3e4, frame_s=0.5, session_frame_s=0.05, read_noise_e=13.0, dark_e_per_s=6.0)
 FEATURES = 39
+SCENES = Prior().draw((N, N), 0)
 CODE = (np.random.default_rng(3).random(FEATURES) < 0.4).astype(np.float64)
 
 
@@ -36,7 +37,7 @@ def side(spectrum: Spectrum | None = None, patterns: FloatArray = DOTS) -> Coded
 @pytest.fixture(scope="module")
 def objective() -> Objective:
     one = side(LINES)
-    return Objective((one, one), LIGHT, Prior())
+    return Objective((one, one), LIGHT, Prior(), SCENES)
 
 
 @pytest.mark.parametrize(("spectrum", "error"), [(None, 1e-12), (LINES, 5e-3)])
@@ -58,7 +59,7 @@ def test_the_gradient_of_a_code_agrees_with_differences(spectrum: Spectrum | Non
     """Two codes and sides of other patterns, grey codes, exposures by time, light and full well: 1e-8 is usual."""
     random, small = np.random.default_rng(4), 1e-5
     sides = side(spectrum), side(spectrum, 1 - DOTS)
-    objective = Objective(sides, replace(LIGHT, **exposure), Prior())
+    objective = Objective(sides, replace(LIGHT, **exposure), Prior(), SCENES)
     codes = random.random((2, FEATURES))
     found = objective(codes, slopes=True)
     assert (objective.frame_s(codes) == LIGHT.frame_s) != bool(exposure)
@@ -100,7 +101,7 @@ def test_an_impossible_bound_is_refused_by_name(objective: Objective) -> None:
 
 
 def test_the_worst_of_two_exposures_counts(objective: Objective) -> None:
-    dim = Objective(objective.sides, replace(LIGHT, frame_s=0.05), Prior())
+    dim = Objective(objective.sides, replace(LIGHT, frame_s=0.05), Prior(), SCENES)
     worst, mean = (Search([objective, dim], worst=worst).score(CODE).score for worst in (True, False))
     alone = [Search([each]).score(CODE).score for each in (objective, dim)]
     assert mean == pytest.approx(np.sqrt(alone[0] * alone[1]), rel=1e-9)
@@ -116,7 +117,9 @@ def test_the_best_cyclic_patterns_are_those_of_all_codes(
     for number in range(1, 32):
         bits = np.array([number >> place & 1 for place in range(5)], dtype=np.float64)
         patterns.append(np.stack([np.roll(np.tile(bits, 4), shift)[:N] for shift in range(5)], axis=1))
-    every = [Objective((one, one), light, Prior())((CODE, CODE)).total for one in (side(LINES, c) for c in patterns)]
+    every = [
+        Objective((one, one), light, Prior(), SCENES)((CODE, CODE)).total for one in (side(LINES, c) for c in patterns)
+    ]
     search = Search([replace(objective, light=light)])
     lit = search.best_patterns(CODE, 5)
     found = search.lit_by(lit).score(CODE).score
