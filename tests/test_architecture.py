@@ -483,7 +483,7 @@ SIZES = {
     "calibrate": (5, 1191),
     "cli": (6, 1538),
     "core": (17, 3081),
-    "design": (8, 1358),
+    "design": (8, 1369),
     "devices": (9, 2209),
     "exchange": (5, 1299),
     "learn": (5, 1190),
