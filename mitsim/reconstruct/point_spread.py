@@ -579,7 +579,7 @@ def reconstruct_psf_request(
         rows, columns = shots.read(shots.manifest.patterns.captures[0].file)[0]["DN"].shape
         if min(rows, columns) < reduce:
             raise MitsimError(f"{shots.name}: frames of {rows} x {columns} pixels; reduce by less than {reduce}")
-        uniform = left.shape[1] == right.shape[1] == 1 and bool((left == 1).all() and (right == 1).all())
+        uniform = all(side.shape[1] == 1 and bool((side == 1).all()) for side in (left, right))
         sensor = rows // reduce, columns // reduce
         camera = ShiftedLight(light, sensor, None if uniform else shots.patterns, np.float32)
         numbers = camera.grid[0] * camera.grid[1] + camera.count * sensor[0] * sensor[1]

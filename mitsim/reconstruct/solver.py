@@ -313,8 +313,8 @@ def factorise(phi: FloatArray, patterns: FloatArray, groups: tuple[Group, ...], 
         pieces = [parts[b][0][index] for b in lit] or [np.zeros((sensor, 0))]
         # Equally spaced columns are a slice, because basic indexing is a view and twice as fast.
         step = int(columns[1] - columns[0]) if len(columns) > 1 else 1
-        even = slice(int(columns[0]), int(columns[-1]) + 1, step) if len(columns) else slice(0, 0)
-        places = even if (np.diff(columns) == step).all() else columns
+        even = len(columns) > 0 and bool((np.diff(columns) == step).all())
+        places = slice(int(columns[0]), int(columns[-1]) + 1, step) if even else columns
         slabs.append(Slab(places, _frozen(np.concatenate(pieces, axis=1))))
     return Side(
         basis=_frozen(basis),

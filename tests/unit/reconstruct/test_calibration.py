@@ -82,6 +82,7 @@ def test_dark_lines_flag_factors_and_twins_that_patterns_resolve_do_not():
     got = estimate_factors(*responses(left, right), H)
     assert got.condition == np.inf and got.rank == (N - 1, N) and got.ok
     assert "uniform light alone leaves 1 directions of scene rows" in str(got.status)
+    assert "which dots resolve (--patterns dots:7)" in str(got.status)
     left[:, 1] = 0
     got = estimate_factors(*responses(left, right), H)
     assert not got.ok and str(got.status).startswith("Factors are rank deficient: 1 scene rows")

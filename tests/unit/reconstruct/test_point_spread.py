@@ -82,6 +82,8 @@ def test_frames_are_the_definition_s_and_their_adjoint_is_the_transpose(light: p
     scene = rng.normal(size=light.scene)
     frames = light.image_of(scene)
     np.testing.assert_allclose(frames.ravel(), whole @ scene.ravel(), atol=1e-13)
+    if light.patterns is None:
+        assert [part.start for part in light.window] == [(size - 1) // 2 for size in light.psf.shape]
     data = rng.normal(size=frames.shape)
     np.testing.assert_allclose(light.correlate(data).ravel(), whole.T @ data.ravel(), atol=1e-13)
     assert np.square(whole).sum(axis=0).mean() <= light.column_power * (1 + 1e-12)
@@ -204,7 +206,7 @@ def test_light_that_is_turned_or_random_is_flagged() -> None:
             "random numbers": np.random.default_rng(0).random(light.shape),
         }
         right = ps.find_fit(ps.ShiftedLight(light, (48, 56), precision=np.float32), frames.astype(np.float32), None)
-        assert right.fault == ("", "") and right.gain is not None and right.gain > 1
+        assert right.fault == ("", "") and right.gain is not None and right.gain > 1 and not right.stated
         if noise < 0.01:
             for name, other in wrong.items():
                 camera = ps.ShiftedLight(np.ascontiguousarray(other / other.sum()), (48, 56), precision=np.float32)
@@ -409,6 +411,9 @@ def test_dots_find_the_scene_and_uniform_light_all_that_the_sensor_sees() -> Non
     assert found.image.shape == (60, 62) and found.image.min() >= 0 and found.lam > 0
     reduced = ms.reconstruct_psf(shots, light_of_a_point(), reduce=2)
     assert reduced.image.shape == (30, 31)
+    shots, _ = capture("uniform", (30, 31))
+    shots.__dict__["patterns"] = np.arange(2.0).repeat(6)[:, None], np.ones((SCENE_SIZE, 1))
+    assert ms.reconstruct_psf(shots, light_of_a_point(), lam=1.0).image.shape == (SCENE_SIZE, SCENE_SIZE)
 
 
 def test_saturated_frames_are_flagged() -> None:

@@ -191,6 +191,7 @@ def test_a_status_is_a_verdict_with_a_remedy(shots: Capture, factors: Factors) -
     flagged = Factors(twins.left, twins.right, factors.manifest.model_copy(update={"warnings": ("old",)}), twins.status)
     result = reconstruct(shots, flagged, 1.0)
     assert not result.ok and str(result.status).endswith("In the calibration, old")
+    assert Status(Verdict.SOLVED, "Solved", flags=("old",)).reasons == ("old",)
     assert "data:image/png" in result._repr_html_() and "old" in result._repr_html_()
 
 

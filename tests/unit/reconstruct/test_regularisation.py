@@ -220,6 +220,10 @@ def test_what_frames_are_known_to_have_beside_the_image_counts_as_noise():
     assert best - decibels(solver.automatic_lambda(problem)) > 3
     more = replace(problem, energy=problem.energy + beyond)
     assert solver.is_misfit(more) and not solver.is_misfit(replace(more, energy=more.energy - beyond))
+    # A large lambda moves this image least, but takes away more than 30 times the noise.
+    data, sigma = np.where(sigma == 100, 100.0, 10.0), np.where(sigma == 100, 100.0, 0.1)
+    faint = solver.DiagonalProblem(sigma, data, float(np.square(data).sum() + beyond), 4900, halves)
+    assert solver.automatic_lambda(faint, explained=False) < 1e-3
 
 
 @pytest.mark.parametrize("patterns", [1, 5])

@@ -274,6 +274,8 @@ def test_readings_that_fit_alike_are_all_listed() -> None:
     cause, words = reported("dots:4", lambda frames: [frames[4 * (k % 4) + k // 4] for k in range(16)], bench())
     assert cause is Cause.READING and len(words) == 2
     assert any("transposed" in each for each in words) and any("column-major" in each for each in words)
+    # In light so dim that chance hides half of the misfit.
+    assert reported("random:4", lambda frames: [*frames[1:], frames[0]], replace(CAMERA, peak=14.0))[0] is Cause.READING
 
 
 def test_a_scene_that_does_not_fit_is_no_other_reading() -> None:
