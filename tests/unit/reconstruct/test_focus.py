@@ -8,6 +8,7 @@ the mask's shadow from there. That also the sensor's own width makes parallax is
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -221,10 +222,14 @@ def test_faulty_frames_are_named_at_the_end_of_a_range(fine: Factors, depth_rang
 
 
 @pytest.mark.parametrize("patterns", ["hadamard:4", "random:6"])
-def test_other_patterns_tell_depth(fine: Factors, patterns: str) -> None:
-    """Without a period, so that none is named."""
+def test_other_patterns_tell_depth(fine: Factors, patterns: str, tmp_path: Path) -> None:
+    """Without a period, so that none is named; of dots along columns alone all is tried beyond the range."""
     found = best_depth(beside(440.0, patterns), fine)
     assert not found.doubt and not found.alternatives and abs(found.mm - 440) < 2 * found.error_mm < 1
+    row, column = np.indices((COARSE, COARSE))
+    own = [(column % 4 == dot) & (row % step == 0) for step in (1, 2) for dot in range(4)]
+    np.save(tmp_path / "own.npy", np.array(own, dtype=np.uint8) * 255)
+    assert abs(best_depth(beside(720.0, str(tmp_path / "own.npy")), fine).mm - 720) < 2
 
 
 def test_light_of_a_lamp_does_not_move_depth(fine: Factors) -> None:
