@@ -129,8 +129,8 @@ TOY = """
 import contextlib, io, json, sys
 from mitsim.devices.patterns import pattern_family
 
-@pattern_family("bars:K", label="broad bars")
-def bars(axis):
+@pattern_family("slats:K", label="broad slats")
+def slats(axis):
     import numpy as np
     return (np.arange(axis.n)[:, None] * axis.k // axis.n == np.arange(axis.k)).astype(np.int8)
 
@@ -146,7 +146,7 @@ for line in sys.argv[1:]:
             code = ended.code or 0
     done[line] = code, out.getvalue(), err.getvalue(), "numpy" in sys.modules
 from mitsim.report import label
-print(json.dumps([done, label("bars:3")]))
+print(json.dumps([done, label("slats:3")]))
 """
 """A family that is registered, and nothing else, and command lines of it."""
 
@@ -156,12 +156,12 @@ def test_a_registered_family_is_known_to_the_command_line(tmp_path: Path) -> Non
     written out in the help, or in what reads them.)"""
     helps = [f"{command} --help" for command in ("capture", "patterns")]
     refused = {
-        "patterns bars:9 -o q --projector-pixels 8": "give 1 to 8, the projector's",
-        "capture photograph --patterns bars:200 -o q": "give 1 to 128",
-        "capture photograph --patterns bars -o q": "random:K, bars:K",
-        "patterns bars:2 -o q --seed 1": "not drawn at random",
+        "patterns slats:9 -o q --projector-pixels 8": "give 1 to 8, the projector's",
+        "capture photograph --patterns slats:200 -o q": "give 1 to 128",
+        "capture photograph --patterns slats -o q": "random:K, slats:K",
+        "patterns slats:2 -o q --seed 1": "not drawn at random",
     }
-    drawn = "patterns bars:2 -o p --projector-pixels 8"
+    drawn = "patterns slats:2 -o p --projector-pixels 8"
     environment = {"COLUMNS": "200", "HOME": str(tmp_path), "PYTHONPATH": str(Path(__file__).parents[3])}
     done = subprocess.run(
         [sys.executable, "-c", TOY, *helps, *refused, drawn],
@@ -170,13 +170,13 @@ def test_a_registered_family_is_known_to_the_command_line(tmp_path: Path) -> Non
     assert done.returncode == 0, done.stderr
     found, label = json.loads(done.stdout)
     for line in helps:
-        assert "random:K, bars:K" in " ".join(found[line][1].split())
+        assert "random:K, slats:K" in " ".join(found[line][1].split())
     for line, fragment in refused.items():
         code, _, err, numpy_is_there = found[line]
         assert code == 2 and fragment in err and (not numpy_is_there or "--seed" in line), found[line]
     assert found[drawn][0] == 0, found[drawn]
     assert len([*(tmp_path / "p" / "patterns").glob("pattern_*")]) == 4
-    assert label == "9 broad bars"
+    assert label == "9 broad slats"
 
 
 def test_a_name_is_registered_once() -> None:
