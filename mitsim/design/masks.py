@@ -169,7 +169,6 @@ def objectives(stand: Stand, goal: Goal, choice: Choice, session_s: float) -> li
                 session_frame_s=session_s,
                 read_noise_e=sensor.superpixel_read_noise_e,
                 dark_e_per_s=sensor.superpixel_dark_current_e_per_s,
-                board=1.0,
                 most_e=_FULL * sensor.superpixel_full_well_e,
             )
             found.append(Objective((rows, columns), light, prior, scenes))
@@ -217,6 +216,7 @@ def searches(stand: Stand, goal: Goal, session_s: float) -> dict[Choice, Search]
     return {choice: search_of(stand, goal, choice, session_s) for choice in order}
 
 
+@single_threaded_blas()
 def run_search(
     stand: Stand, goal: Goal, folder: Path, job: Job, session_s: float, every: dict[Choice, Search]
 ) -> tuple[list[Candidate], bool]:

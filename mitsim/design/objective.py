@@ -1,11 +1,13 @@
 """Expected error of a camera as a function of its separable mask code, with its gradient.
 
-Shadows of geometric optics are linear in the code: a factor is F = T a with a sparse T, whose rows are pairs of sensor
-pixel and projector pixel. Its derivative F' by the position of a projector pixel is linear in a likewise. Therefore the
-gradient of :func:`mitsim.design.expected.expected_error` with respect to the code is exact.
+A factor is F = T I with a sparse T, whose rows are pairs of sensor pixel and projector pixel, and the light I behind
+the mask. In geometric optics I is the code itself; for waves it is a sum of squared fields that are linear in the code.
+The derivative F' by the position of a projector pixel is linear in I likewise. Therefore the gradient of
+:func:`mitsim.design.expected.expected_error` with respect to the code is exact. Ambient light is neglected.
 
-A scene is a mean and stationary detail with the covariance sigma^2 rho^(|p - p'| + |q - q'|) of the solver ``markov``.
-Between its pixels such a scene is an Ornstein-Uhlenbeck process. Its first moment inside a pixel of unit width has the
+The bias of regularisation is that of given scenes. For the noise of factors and for detail inside pixels, a scene is a
+mean and stationary detail with the covariance sigma^2 rho^(|p - p'| + |q - q'|) of the solver ``markov``. Between its
+pixels such a scene is an Ornstein-Uhlenbeck process. Its first moment inside a pixel of unit width has the
 variance sigma^2 (1 - rho) / 60 to first order in 1 - rho.
 """
 
@@ -75,8 +77,6 @@ class Light:
     session_frame_s: float
     read_noise_e: float
     dark_e_per_s: float
-    board: float = 0.99
-    pairs: bool = True
     signal_e: float | None = None
     most_e: float = math.inf
 
@@ -286,10 +286,10 @@ class Objective:
         noise = light.read_noise_e**2 / electrons**2 + light.dark_e_per_s / light.gain / electrons
         full = [float(factor.mean(axis=0).sum()) for factor in factors]
         response = (light.read_noise_e**2 + light.dark_e_per_s * light.session_frame_s) / session**2
-        response = (response + light.board / 2 * full[0] * full[1] / session) * (2 if light.pairs else 1)
+        response = 2 * (response + full[0] * full[1] / 2 / session)  # both shots of a pair
         common = [factor.sum(axis=1) for factor in factors]
         norms = [float(each @ each) for each in common]
-        scale = [1 / (light.board**2 * gram.shape[0]) for gram in grams]
+        scale = [1 / gram.shape[0] for gram in grams]
         errors = [response * scale[0] / norms[1], response * scale[1] / norms[0]]
         moment = prior.deviation**2 * (1 - prior.correlation) * _MOMENT
         causes = [
@@ -323,7 +323,7 @@ class Objective:
                 by_exposure = by_weight[0] * (noise + (light.read_noise_e / electrons) ** 2)
                 by_factor -= (by_exposure + by_weight[1] * prior.mean / electrons) * exposed[own]
             by_response = sum(by_weight[2 + k] * errors[k] for k in (0, 1)) / response
-            by_factor += by_response * (2 if light.pairs else 1) * light.board / 2 / session * full[other] / rows
+            by_factor += by_response / session * full[other] / rows
             # The error of the other factor falls with the norm of this side's common response.
             by_factor += (-2 * by_weight[2 + other] * errors[other] / norms[own]) * common[own][:, None]
             gradients.append(stack.factor.back(by_factor, by_derivative) / pixels)

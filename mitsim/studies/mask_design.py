@@ -142,11 +142,8 @@ def design(
     """Search a mask for a goal, prove it by rendered images, and write its files; see :func:`mitsim.design`."""
     from mitsim.api.bench import open_bench
 
-    job, earlier, text = (
-        job or Job(),
-        Path(output) / GOAL,
-        tomli_w.dumps(asked.model_dump(mode="json", exclude_none=True)),
-    )
+    job, earlier = job or Job(), Path(output) / GOAL
+    text = tomli_w.dumps(asked.model_dump(mode="json", exclude_none=True))
     same = resume and earlier.is_file()
     if same and read_text(earlier, 1 << 16) != text:
         raise MitsimError(f"output {output}: was begun for another goal; give its own goal, or another folder")
@@ -173,6 +170,8 @@ def design(
         own = every[best.choice]
         texts = dict.fromkeys(text for each in proved for text in each.warnings)
         warnings = [f"{', '.join(each.name for each in proved if text in each.warnings)}: {text}" for text in texts]
+        if stand.ambient is not None:
+            warnings.append("The search neglects the light of lamps, which predicted and rendered images have")
         if best.rendered < best.predicted - _SHORT_DB:
             short = f"by {best.predicted - best.rendered:.1f} dB; a cause that the prediction lacks matters"
             warnings.append(f"The rendered image is worse than predicted: {short} in this scene")
