@@ -157,7 +157,10 @@ def test_a_resumed_search_ends_as_one_without_a_stop(stand: Stand, tmp_path: Pat
 
 
 def test_the_drawn_mask_casts_the_shadow_of_the_code(stand: Stand, tmp_path: Path) -> None:
-    """An asymmetric code, so that a mirrored or shifted drawing is seen; the waves' grid errs by 5e-3."""
+    """An asymmetric code, so that a mirrored or shifted drawing is seen; the waves' grid errs by 5e-3.
+
+    The predictor, which is another program for the same errors, agrees by cause within 8 %.
+    """
     (objective,) = objectives(stand, Goal(**GOAL), CHOICE, 0.01)
     side = objective.sides[0]
     code = np.zeros(side.features)
@@ -169,6 +172,13 @@ def test_the_drawn_mask_casts_the_shadow_of_the_code(stand: Stand, tmp_path: Pat
     found = side(code).values
     scale = float(np.vdot(found, left) / np.vdot(found, found))
     assert np.linalg.norm(scale * found - left) < 1e-2 * np.linalg.norm(left)
+    predicted = bench.predict("dots:3", exposure=objective.frame_s((code, code)))
+    (objective,) = objectives(stand, Goal(**GOAL), CHOICE, predicted.session_exposure_s)
+    parts = objective((code, code), predicted.errors.lam / objective.light.gain**2).parts
+    causes = {**predicted.errors.causes}
+    causes["dark_and_read_noise"] = causes["dark_current"] + causes["read_noise"]
+    for name in ("shot_noise", "dark_and_read_noise", "calibration_noise", "regularisation_bias"):
+        assert parts[name] == pytest.approx(causes[name], rel=0.1), name
     assert (tmp_path / "mask" / "mask.svg").read_text().count("<rect") == np.count_nonzero(np.diff(code) == 1) ** 2
 
 
