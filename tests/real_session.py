@@ -28,11 +28,14 @@ ROWS, COLUMNS, N = 24, 20, 4
 
 
 def write_image(path: Path, numbers: np.ndarray) -> None:
-    """``numbers`` as a PNG or TIFF of 16 bits, as NPY or OpenEXR, or bare, the large byte first."""
+    """``numbers`` as a PNG or TIFF of 16 bits, as NPY or OpenEXR, or bare, the large byte first, or of 12 packed bits, the lowest first."""
     if path.suffix == ".npy":
         np.save(path, numbers.astype(np.uint16))
     elif path.suffix == ".raw":
         numbers.astype(">u2").tofile(path)
+    elif path.suffix == ".bin":
+        bits = sum(int(number) << 12 * place for place, number in enumerate(numbers.ravel()))
+        path.write_bytes(bits.to_bytes(numbers.size * 12 // 8, "little"))
     elif path.suffix == ".exr":
         write_frame(path, {"DN": numbers.astype(np.uint32)}, {})
     else:

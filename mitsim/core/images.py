@@ -33,7 +33,9 @@ from mitsim.core.picture_files import (
     FORMATS,
     FRAME,
     JPEG,
+    PIXEL_FORMATS,
     PRINTS,
+    PixelFormat,
     Preparation,
     Wanted,
     image_files,
@@ -61,6 +63,12 @@ _TURNS[8] = (1, False)
 _MOST_PAGES = 1 << 16
 _PIXEL_BYTES = 24
 """Memory of a pixel while a page is read and checked; measured: at most 21, for a PNG of 16 bits."""
+_TWINS: dict[PixelFormat, PixelFormat] = {"Mono12p": "Mono12Packed", "Mono12Packed": "Mono12p"}
+"""Packed formats that differ in the order of bits alone."""
+_FEW = 64
+"""Numbers that may have two zero bits in common by chance."""
+_SMOOTHER = 4.0
+"""Factor by which another packed format makes neighbours more alike before the stated one is refused."""
 _BLACK_IS_ZERO, _RGB = 1, 2
 """PhotometricInterpretation of TIFF; 0 (refused) stores black as the largest number."""
 _CHANNEL = "DN"
@@ -227,16 +235,63 @@ def _exr(path: Path, wanted: Wanted) -> _Reader:
 def _bare(path: Path, wanted: Wanted) -> _Reader:
     raw = wanted.raw
     if raw is None:
-        raise wanted.refusal(path, "has no header; say how it is read by shape and bits")
-    needed, size = math.prod(raw.shape) * raw.kind.itemsize, path.stat().st_size
+        raise wanted.refusal(path, "has no header; say how it is read by shape and bits, or by shape and pixel_format")
+    form, count, size = raw.pixel_format, math.prod(raw.shape), path.stat().st_size
+    bits, stored = PIXEL_FORMATS[form] if form else (raw.bits or 0, 8 * raw.kind.itemsize)
+    needed = -(-count * stored // 8)
     if size != needed:
-        claimed = f"{raw.shape[0]}x{raw.shape[1]} numbers of {raw.bits} bits take {needed}"
-        raise wanted.refusal(path, f"has {size} bytes, but {claimed}; correct shape or bits")
+        numbers, name = (f"numbers in {form}", "pixel_format") if form else (f"numbers of {bits} bits", "bits")
+        claimed = f"{size_of(raw.shape)} {numbers} take {needed}"
+        raise wanted.refusal(path, f"has {size} bytes, but {claimed}; correct shape or {name}")
     yield 1, raw.shape, _PIXEL_BYTES
-    values = np.fromfile(path, raw.kind, math.prod(raw.shape)).reshape(raw.shape)
-    if (most := values.max()) >= 2**raw.bits:
-        raise wanted.refusal(path, f"has the number {most}, beyond {raw.bits} bits; correct bits or byte_order")
-    yield values
+    stream = np.fromfile(path, raw.kind, needed // raw.kind.itemsize)
+    values = _unpack(stream, form, count) if form else stream
+    if form:
+        _check_format(path, wanted, form, stream, values)
+    elif (most := values.max()) >= 2**bits:
+        raise wanted.refusal(path, f"has the number {most}, beyond {bits} bits; correct bits or byte_order")
+    yield values.reshape(raw.shape)
+
+
+def _unpack(stream: npt.NDArray[np.uint8], form: PixelFormat, count: int) -> Numbers:
+    """Return ``count`` numbers from the bytes of a packed format of GenICam (PFNC 2.4 and GigE Vision 2.2).
+
+    A format with p is a stream of bits, lowest bits first. A Packed one has two numbers in three bytes: the high eight
+    bits of each, and between them the low bits, those of the first number from bit 0 and of the second from bit 4.
+    """
+    bits, stored = PIXEL_FORMATS[form]
+    low, numbers, size = bits - 8, *((4, 5) if stored == 10 else (2, 3))
+    group = np.zeros((-(-count // numbers), size), np.uint16)
+    group.ravel()[: len(stream)] = stream
+    values = np.empty((len(group), numbers), np.uint16)
+    for k in range(numbers):
+        if form.endswith("Packed"):
+            values[:, k] = group[:, 2 * k] << low | group[:, 1] >> 4 * k & (1 << low) - 1
+        else:
+            values[:, k] = (group[:, k] | group[:, k + 1] << 8) >> low * k & (1 << bits) - 1
+    return values.ravel()[:count]
+
+
+def _check_format(path: Path, wanted: Wanted, form: PixelFormat, stream: Numbers, values: Numbers) -> None:
+    """Refuse numbers in another packed format of the same length.
+
+    Mono10Packed leaves four bits of three bytes zero, which are bits 2 and 3 of a number in Mono12Packed. Mono12p and
+    Mono12Packed exchange parts of every second number, so that in the wrong one most neighbours differ by much.
+    """
+
+    def roughness(numbers: Numbers) -> float:
+        return float(np.median(np.abs(np.diff(numbers.astype(np.int32))))) if len(numbers) > 1 else 0.0
+
+    twin, bright = _TWINS.get(form), values[values > 0b1111]
+    if form == "Mono10Packed" and (stream[1::3] & 0b11001100).any():
+        likely = "Mono12Packed or Mono12p"
+    elif form == "Mono12Packed" and len(bright) > _FEW and (bright & 0b11).any() and not (bright & 0b1100).any():
+        likely = "Mono10Packed"
+    elif twin and _SMOOTHER * roughness(_unpack(stream, twin, len(values))) < roughness(values):
+        likely = twin
+    else:
+        return
+    raise wanted.refusal(path, f"is probably in {likely}, not in {form}; correct pixel_format")
 
 
 _READERS: dict[str, Callable[[Path, Wanted], _Reader]] = {

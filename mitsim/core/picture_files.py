@@ -22,6 +22,11 @@ PRINTS = (*FORMATS, *JPEG)
 """Formats of pictures for prints."""
 BARE = (".raw", ".bin", ".dat")
 """Formats without a header."""
+PixelFormat = Literal["Mono10p", "Mono12p", "Mono10Packed", "Mono12Packed"]
+PIXEL_FORMATS: dict[PixelFormat, tuple[int, int]] = {
+    "Mono10p": (10, 10), "Mono12p": (12, 12), "Mono10Packed": (10, 12), "Mono12Packed": (12, 12),
+}  # fmt: skip
+"""Bits of a number in each packed format of GenICam, and the bits that it takes in a file."""
 _Side = Annotated[int, Field(ge=1, le=MOST_SIDE)]
 _Place = Annotated[int, Field(ge=0, lt=MOST_SIDE)]
 PLANES = ("r", "gb", "gr", "b")
@@ -55,28 +60,44 @@ class Raw(Configuration):
 
     shape: tuple[_Side, _Side] = Field(strict=False)
     """Rows and columns."""
-    bits: int = Field(ge=1, le=32)
-    """Bits of a number; up to 8 take a byte, up to 16 two, up to 32 four."""
+    bits: int | None = Field(default=None, ge=1, le=32)
+    """Bits of a number; up to 8 take a byte, up to 16 two, up to 32 four; none: as `pixel_format` states."""
     byte_order: Literal["little", "big"] = "little"
     """Order of the bytes of a number."""
+    pixel_format: PixelFormat | None = None
+    """Packed format of the numbers, by its name in GenICam, in place of `bits` and `byte_order`; none: whole bytes."""
+
+    @model_validator(mode="after")
+    def _has_one_layout(self) -> Raw:
+        whole = self.model_fields_set & {"bits", "byte_order"}
+        if self.pixel_format is None and self.bits is None:
+            raise ValueError("has neither bits nor pixel_format; give one")
+        if self.pixel_format is not None and whole:
+            raise ValueError(f"pixel_format states {' and '.join(sorted(whole))}, too; leave this out")
+        return self
 
     @classmethod
-    def of(cls, shape: str, bits: int | None, byte_order: str) -> Raw:
+    def of(cls, shape: str, bits: int | None, byte_order: str, pixel_format: PixelFormat | None = None) -> Raw:
         """Return a Raw from words of the command line; MitsimError for invalid ones."""
         sides = re.fullmatch(r"([0-9]{1,5})x([0-9]{1,5})", shape)
         if not sides or not all(0 < int(side) <= MOST_SIDE for side in sides.groups()):
             raise ArgumentError("shape", f"{shape!r}: give ROWSxCOLUMNS, 1 to {MOST_SIDE} each")
+        size = {"shape": [int(sides[1]), int(sides[2])]}
+        if pixel_format is not None:
+            return validate(cls, {**size, "pixel_format": pixel_format}, "raw")
         if bits is None or not 1 <= bits <= 32:
             raise ArgumentError("bits", f"{bits}: give the bits of a number in such a file, 1 to 32")
         if byte_order not in ("little", "big"):
             raise ArgumentError("byte_order", f"{byte_order!r}: use little or big")
-        return validate(cls, {"shape": [int(sides[1]), int(sides[2])], "bits": bits, "byte_order": byte_order}, "raw")
+        return validate(cls, {**size, "bits": bits, "byte_order": byte_order}, "raw")
 
     @property
     def kind(self) -> Any:
-        """Return NumPy's type of the numbers."""
+        """Return NumPy's type of the numbers; of packed ones, of their bytes."""
         import numpy as np  # here: most who state it read no numbers
 
+        if self.bits is None:
+            return np.dtype(np.uint8)
         width = 1 if self.bits <= 8 else 2 if self.bits <= 16 else 4
         return np.dtype(f"{'<' if self.byte_order == 'little' else '>'}u{width}")
 
@@ -194,7 +215,7 @@ def image_files(source: Path, wanted: Wanted = FRAME) -> tuple[Path, ...]:
     endings = tuple(ending for ending in (*FORMATS, *BARE) if wanted.raw or ending not in BARE)
     files = [path for path in source.iterdir() if path.suffix.lower() in endings and not path.name.startswith(".")]
     if not files:
-        bare = "" if wanted.raw else f"; {', '.join(BARE)} count where shape and bits are stated"
+        bare = "" if wanted.raw else f"; {', '.join(BARE)} count where shape and bits or pixel_format are stated"
         raise MitsimError(f"{source}: holds no file that ends in {', '.join(endings)}{bare}")
 
     def natural(path: Path) -> tuple[list[tuple[int, str]], str]:

@@ -15,7 +15,7 @@ from mitsim.core.configuration import Configuration, FilePath, Options, Positive
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.files import check_plain
 from mitsim.core.manifests import MOST_PIXELS, CalibrationManifest, ClosingKind, Digital
-from mitsim.core.picture_files import CORRECTIONS, Crop, Preparation, Raw, Wanted, image_files
+from mitsim.core.picture_files import CORRECTIONS, Crop, PixelFormat, Preparation, Raw, Wanted, image_files
 from mitsim.devices.framelist import Identity
 from mitsim.devices.patterns import is_own, read_name, takes_seed
 from mitsim.devices.sensor import check_exposure, digital_of, load_sensor
@@ -266,6 +266,10 @@ class FrameFacts(Options):
     shape: str | tuple[int, int] | None = said("frame size, for .raw, .bin and .dat files", metavar="ROWSxCOLUMNS")
     bits: int | None = said("bits of each number in .raw, .bin and .dat files", metavar="N")
     byte_order: str | None = said("byte order of .raw, .bin and .dat files: little or big", metavar="ORDER")
+    pixel_format: PixelFormat | None = said(
+        "packed format of .raw, .bin and .dat files, in place of bits and byte order",
+        metavar="Mono10p|Mono12p|Mono10Packed|Mono12Packed",
+    )
     channel: str | None = said("colour plane to use behind colour filters, or all planes", metavar="r|gb|gr|b|all")
     mosaic: str | None = said(
         "colour filters of the first 2 x 2 pixels; by default those of the camera", metavar="RGGB|BGGR|GRBG|GBRG"
@@ -287,7 +291,11 @@ class FrameFacts(Options):
             for path in (source, *(source.iterdir() if source.is_dir() else ()))
         )
         if self.shape is None or not bare:
-            self.refuse(("shape", "bits", "byte_order"), "on files that have a header, or without a shape")
+            self.refuse(
+                ("shape", "bits", "byte_order", "pixel_format"), "on files that have a header, or without a shape"
+            )
+        if self.pixel_format is not None:
+            self.refuse(("bits", "byte_order"), f"with {self.pixel_format}, which states it")
         listed = CaptureList() if self.list is None else load_capture_list(self.list)
         known, prepare = (
             {name: getattr(each, name) for name in each.model_fields_set} for each in (listed, listed.prepare)
@@ -307,7 +315,7 @@ class FrameFacts(Options):
         if self.calibration is not None:
             known.pop("n", None)
         if self.shape is not None:
-            known["raw"] = Raw.of(_text_of(self.shape, "x"), self.bits, self.byte_order or "little")
+            known["raw"] = Raw.of(_text_of(self.shape, "x"), self.bits, self.byte_order or "little", self.pixel_format)
         known |= {name: given[name] for name in same & CaptureList.model_fields.keys()}
         known["prepare"] = validate(Preparation, prepare, "import")
         calibration = None if self.calibration is None else Path(self.calibration)

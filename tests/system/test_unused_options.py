@@ -34,13 +34,14 @@ CASES = [
         for option in (
             *("--patterns uniform", "--camera imx249", "--exposure 1", "--calibration {cal}", "--projector-pixels 128"),
             *("--black-level 3", "--ambient-frame {folder}/a.png", "--ambient-shots 2", "--shape 8x8", "--bits 8"),
-            *("--byte-order little", "--seed 0"),
+            *("--byte-order little", "--seed 0", "--pixel-format Mono10p"),
         )
     ),
     (f"import {{folder}}/a.png {FRAMES} -o {{out}}", "--bits 8"),
     (f"import {{folder}}/a.png {FRAMES} -o {{out}}", "--byte-order big"),
     (f"import {{folder}}/a.png {FRAMES} -o {{out}}", "--shape 8x8"),
     (f"import {{folder}}/a.raw {FRAMES} --shape 8x8 --bits 16 -o {{out}}", "--seed 3"),
+    (f"import {{folder}}/a.raw {FRAMES} --shape 8x8 --pixel-format Mono12p -o {{out}}", "--bits 12"),
     ("patterns dots:3 -o {out}", "--seed 1"),
     ("patterns dots:3 -o {out}", "--signed-capture pair"),
     ("patterns stripes --camera imx249 --exposure 1 -o {out}", "--seed 1"),

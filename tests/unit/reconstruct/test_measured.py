@@ -30,14 +30,15 @@ def error(factors: Factors, session: RealSession) -> tuple[float, float]:
     return errors[0], errors[1]
 
 
-@pytest.mark.parametrize("ending", ["png", "exr", "raw"])
+@pytest.mark.parametrize("ending", ["png", "exr", "raw", "bin"])
 def test_the_factors_of_pairs_are_the_cameras_within_their_stated_noise(tmp_path: Path, ending: str) -> None:
     """(Planted: halves in the other order, the transposed side, a black level left in.) 96 numbers of a factor tell a
     noise to 7 %; the product of both is in electrons a second."""
     session = RealSession()
     folder = session.write(tmp_path / "frames", name=("f_{}." + ending).format)
-    if ending == "raw":
-        write_list(folder, raw={"shape": [ROWS, COLUMNS], "bits": 12, "byte_order": "big"})
+    layout = {"raw": {"bits": 12, "byte_order": "big"}, "bin": {"pixel_format": "Mono12p"}}.get(ending)
+    if layout is not None:
+        write_list(folder, raw={"shape": [ROWS, COLUMNS], **layout})
     factors = calibrate_frames(folder)
     assert factors.ok, factors.warnings
     for own, stated in zip(error(factors, session), factors.estimate.predicted_error, strict=True):
