@@ -28,7 +28,7 @@ ROWS, COLUMNS, N = 24, 20, 4
 
 
 def write_image(path: Path, numbers: np.ndarray) -> None:
-    """``numbers`` as a PNG or TIFF of 16 bits, as NPY or OpenEXR, or bare, the large byte first, or of 12 packed bits, the lowest first."""
+    """``numbers`` as a PNG or TIFF of 16 bits, as NPY or OpenEXR, or bare: the large byte first, or Mono12p."""
     if path.suffix == ".npy":
         np.save(path, numbers.astype(np.uint16))
     elif path.suffix == ".raw":

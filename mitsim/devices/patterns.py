@@ -8,7 +8,7 @@ imported only where patterns are made.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from itertools import count, product
@@ -31,6 +31,8 @@ if TYPE_CHECKING:
 
 _MOST_DIGITS = 9
 _MOST_CHECKED = 4096
+ORDERS = "natural", "sequency", "dyadic", "cake-cutting"
+"""Orders of Sylvester's Hadamard patterns: names that may follow the K of a family."""
 
 # ---- What is projected ----
 
@@ -77,12 +79,16 @@ class Lighting:
 
 @dataclass(frozen=True, eq=False)
 class PatternFamily:
-    """Factors of patterns, and the ``grey`` pictures that show them, rounded to 8 bits; None for 0/1 and +-1."""
+    """Factors of patterns, and the ``grey`` pictures that show them, rounded to 8 bits; None for 0/1 and +-1.
+
+    ``order`` is one of :data:`ORDERS`, in which shots are taken; empty for row-major.
+    """
 
     name: str
     left: PatternFactor | FloatArray
     right: PatternFactor | FloatArray
     grey: pattern_files.GreyPictures | None = None
+    order: str = ""
 
     @property
     def n(self) -> int:
@@ -92,10 +98,17 @@ class PatternFamily:
     def signed(self) -> bool:
         return bool((self.left < 0).any() or (self.right < 0).any())
 
-    @property
+    @cached_property
     def shots(self) -> tuple[Shot, ...]:
-        places = product(range(self.left.shape[1]), range(self.right.shape[1]), (1, -1) if self.signed else (0,))
-        return tuple(Shot(*place) for place in places)
+        sizes = self.left.shape[1], self.right.shape[1]
+        shots = tuple(Shot(*place) for place in product(*map(range, sizes), (1, -1) if self.signed else (0,)))
+        if not self.order:
+            return shots
+        import numpy as np
+
+        row, column = np.array([(shot.row, shot.column) for shot in shots]).T
+        taken = np.lexsort(_walks(sizes, row, column)[self.order][::-1])  # stable: + stays before -
+        return tuple(shots[index] for index in taken)
 
     def light(self, shot: Shot) -> FloatArray:
         import numpy as np
@@ -288,7 +301,7 @@ def shifting_dots(axis: PatternAxis) -> PatternFactor:
     return np.asarray(np.arange(axis.n)[:, None] % axis.k == np.arange(axis.k)[None, :], dtype=np.int8)
 
 
-@pattern_family("hadamard:K", label="Hadamard", signed=lambda k: k > 1, check=way_to)
+@pattern_family("hadamard:K", "hadamard:K:ORDER", label="Hadamard", signed=lambda k: k > 1, check=way_to)
 def repeated_hadamard(axis: PatternAxis) -> PatternFactor:
     """Half of all pixels lit, by a Hadamard matrix.
 
@@ -343,9 +356,12 @@ def read_name(text: str, n: int | None = None) -> str:
     return text
 
 
-def _read_family(text: str, n: int | None = None) -> tuple[Family, list[int]]:
+def _read_family(text: str, n: int | None = None) -> tuple[Family, list[int], str]:
+    """Return the family, its one or two K, and the order of its shots, empty if none is stated."""
     name, colon, size = text.partition(":")
-    family = FAMILIES.get(name)
+    family, orders = FAMILIES.get(name), list[str]()
+    if family and f"{name}:K:ORDER" in family.forms:
+        size, *orders = size.split(":", 1)
     form = f"{name}:K" if colon else name
     if family is None or form not in family.forms or bool(colon) != bool(size):
         raise ArgumentError("patterns", f"{text!r}: use {pattern_names()}")
@@ -362,8 +378,12 @@ def _read_family(text: str, n: int | None = None) -> tuple[Family, list[int]]:
             raise MitsimError(f"patterns {text!r}: K is {k}; give 1 to {most}{more}")
         if family.check is not None and k <= _MOST_CHECKED:
             family.check(k)
+        if orders and k & (k - 1):
+            raise MitsimError(f"patterns {text!r}: K is {k}, and orders are of powers of 2; use such, or {name}:{k}")
         periods.append(k)
-    return family, periods
+    if orders and orders[0] not in ORDERS:
+        raise MitsimError(f"patterns {text!r}: the order is {orders[0]!r}; use {', '.join(ORDERS)}")
+    return family, periods, "".join(orders)
 
 
 def takes_seed(text: str) -> bool:
@@ -372,7 +392,7 @@ def takes_seed(text: str) -> bool:
 
 
 def shot_count(text: str) -> int:
-    family, periods = _read_family(text)
+    family, periods, _ = _read_family(text)
     return periods[0] * periods[-1] * (2 if any(map(family.signed, periods)) else 1)
 
 
@@ -391,11 +411,11 @@ def parse_patterns(
     if is_own(text):
         own = pattern_files.read_own(text, sides, light)
         return PatternFamily(short_name(text), own.left, own.right, own.grey)
-    family, periods = _read_family(text, min(sides))
+    family, periods, order = _read_family(text, min(sides))
     if (count := shot_count(text)) > MOST_SHOTS:
         raise MitsimError(f"patterns {text!r}: are {count} shots; a run has at most {MOST_SHOTS}, give a smaller K")
     left = family.factor(PatternAxis(sides[0], periods[0], "left", seed))
-    return PatternFamily(text, left, family.factor(PatternAxis(sides[1], periods[-1], "right", seed)))
+    return PatternFamily(text, left, family.factor(PatternAxis(sides[1], periods[-1], "right", seed)), order=order)
 
 
 # ---- Orders in which frames may have been taken ----
@@ -404,11 +424,11 @@ def parse_patterns(
 def shot_orders(patterns: Patterns, taken: str | None = None) -> dict[str, npt.NDArray[np.int64]]:
     """Return orders in which the frames of a run may have been taken, by name, as permutations p.
 
-    Shot k of ``patterns.captures`` is then frame p[k] of those at hand. Captures are ``row-major``; ``column-major``
-    loops over rows inside columns. Sylvester's Hadamard patterns also have ``sequency`` (Walsh), ``dyadic`` (Paley) and
-    ``natural`` order. In signed pairs, + precedes - except for ``halves-exchanged`` (- before +), ``plus-first`` (all +
-    before all -) and ``minus-first``, which also follow another order, as in ``sequency,plus-first``. Two names may
-    have the same permutation. ``taken`` is the order that `mitsim import --order` applied to the frames at hand.
+    Shot k of ``patterns.captures`` is then frame p[k] of those at hand. ``row-major`` loops over columns inside rows,
+    ``column-major`` over rows inside columns. Sylvester's Hadamard patterns also have the :data:`ORDERS`. In signed
+    pairs, + precedes - except for ``halves-exchanged`` (- before +), ``plus-first`` (all + before all -) and
+    ``minus-first``, which also follow another order, as in ``sequency,plus-first``. Two names may have the same
+    permutation. ``taken`` is the order that `mitsim import --order` applied to the frames at hand.
     """
     import numpy as np
 
@@ -418,15 +438,9 @@ def shot_orders(patterns: Patterns, taken: str | None = None) -> dict[str, npt.N
     squares = [side[:size] for side, size in zip(patterns.matrices, sizes, strict=True)]
     sylvester = all(size & (size - 1) == 0 for size in sizes)
     if sign.any() and sylvester and all(map(np.array_equal, squares, map(hadamard_matrix, sizes))):
-        changes = [np.array(np.count_nonzero(np.diff(square, axis=0), axis=0)) for square in squares]
-        sequency = changes[0][row], changes[1][column]
-        # The pattern with s sign changes is number s ^ (s >> 1), the Gray code of s, in Paley's order.
-        dyadic = sequency[0] ^ (sequency[0] >> 1), sequency[1] ^ (sequency[1] >> 1)
-        walks |= {"sequency": sequency, "dyadic": dyadic}
+        walks |= _walks(sizes, row, column)
     orders = {name: _places(*walk, -sign) for name, walk in walks.items()}
     orders["reversed"] = len(row) - 1 - orders["row-major"]
-    if "sequency" in walks:
-        orders["natural"] = orders["row-major"]
     for name, walk in walks.items() if sign.any() else ():
         before = "" if name == "row-major" else f"{name},"
         orders[f"{before}halves-exchanged"] = _places(*walk, sign)
@@ -443,3 +457,16 @@ def _places(*keys: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
     import numpy as np
 
     return np.argsort(np.lexsort(keys[::-1]))
+
+
+def _walks(sizes: Sequence[int], row: Labels, column: Labels) -> dict[str, tuple[Labels, ...]]:
+    """Return the keys by which shots of Sylvester's patterns are sorted, by each of the :data:`ORDERS`."""
+    import numpy as np
+
+    counts = [np.count_nonzero(np.diff(hadamard_matrix(size), axis=0), axis=0) for size in sizes]
+    changes = np.asarray(counts[0])[row], np.asarray(counts[1])[column]
+    # The function with s sign changes is number s ^ (s >> 1), the Gray code of s, in Paley's order.
+    dyadic = changes[0] ^ (changes[0] >> 1), changes[1] ^ (changes[1] >> 1)
+    # Sign changes cut a pattern like a cake, in rows and columns, into connected blocks (Yu, Sensors 19, 4122, 2019).
+    blocks = (changes[0] + 1) * (changes[1] + 1)
+    return {"natural": (row, column), "sequency": changes, "dyadic": dyadic, "cake-cutting": (blocks, row, column)}

@@ -14,9 +14,10 @@ def label(name: str) -> str:
     """Return the usual name of the patterns ``name``: "49 dots" for ``dots:7``, "7 x 14 dots" for ``dots:7x14``."""
     if is_own(name):
         return short_name(name)
-    kind, _, size = name.partition(":")
+    kind, size, order = (*name.split(":", 2), "", "")[:3]
     count = size.replace("x", " x ") if "x" in size else size and str(int(size) ** 2)
-    return f"{count} {FAMILIES[kind].label}" if count else kind.capitalize()
+    text = f"{count} {FAMILIES[kind].label}" if count else kind.capitalize()
+    return f"{text}, {order}" if order else text
 
 
 def in_text(name: str) -> str:

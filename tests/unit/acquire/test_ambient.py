@@ -190,6 +190,15 @@ def test_it_is_taken_where_it_helps(light: SampledLight) -> None:
         assert np.array_equal(a, b)
 
 
+def test_frames_in_another_order_are_the_same_frames(light: SampledLight) -> None:
+    """Noise belongs to a pattern, not to its place. (Planted: streams by a shot's number.)"""
+    frames = list[dict[tuple[int, int, int], np.ndarray]]()
+    for run in map(light.expose, ("hadamard:4", "hadamard:4:cake-cutting")):
+        shots = [(shot.row, shot.column, shot.sign) for shot in run.manifest.patterns.captures]
+        frames.append(dict(zip(shots, run.dn, strict=True)))
+    assert [*frames[0]] != [*frames[1]] and all(np.array_equal(dn, frames[1][shot]) for shot, dn in frames[0].items())
+
+
 def test_without_it_the_run_is_flagged(light: SampledLight) -> None:
     """The image would be wrong, in silence; `no` is for those who take it off by themselves."""
     (warning,) = light.expose("dots:2", ambient_frame="no").warnings

@@ -218,8 +218,8 @@ SMOOTH = (900 + 40 * np.sin(np.arange(400) / 30) + np.random.default_rng(5).norm
 
 @pytest.mark.parametrize("form", ["Mono10p", "Mono12p", "Mono10Packed", "Mono12Packed"])
 def test_packed_numbers_are_those_of_an_independent_packer(form: str, tmp_path: Path) -> None:
-    """Also an odd count, whose last bytes are partly used. (Planted, each seen: the second number's low bits from bit 2;
-    the highest bits of a stream first; 12 bits a number for Mono10p.)"""
+    """Also an odd count, whose last bytes are partly used. (Planted: the second number's low bits from bit 2; the
+    highest bits of a stream first; 12 bits a number for Mono10p.)"""
     by_hand = {
         "Mono12p": ("23c1ab", [0x123, 0xABC]), "Mono12Packed": ("12c3ab", [0x123, 0xABC]),
         "Mono10p": ("f1e52a7c01", [0x1F1, 0x2B9, 0x3C2, 5]), "Mono10Packed": ("7c11ae", [0x1F1, 0x2B9]),

@@ -26,7 +26,11 @@ from mitsim.devices.patterns import (
 )
 
 EXAMPLES = [
-    *(form.replace("RxC", "3x5").replace("K", "4") for family in FAMILIES.values() for form in family.forms),
+    *(
+        form.replace("RxC", "3x5").replace("K", "4").replace("ORDER", "cake-cutting")
+        for family in FAMILIES.values()
+        for form in family.forms
+    ),
     *("dots:1", "dots:3", "dots:5", "dots:16", "dots:16x1", "hadamard:1", "hadamard:12", "random:5"),
 ]
 """Each form of every family, and more of some."""
@@ -36,7 +40,7 @@ EXAMPLES = [
 @pytest.mark.parametrize("name", EXAMPLES)
 def test_captures_are_the_patterns_that_the_solver_is_told(name: str, n: int) -> None:
     family = parse_patterns(name, n)
-    rows, cross, columns = name.partition(":")[2].partition("x")
+    rows, cross, columns = name.split(":")[1].partition("x") if ":" in name else ("", "", "")
     k = int(rows or 1)
     # hadamard:1 is all ones, so it needs no second half.
     count = (k * int(columns) if cross else k**2) * (2 if name.startswith("hadamard") and k > 1 else 1)
@@ -114,6 +118,9 @@ def test_random_is_seeded_and_covers_every_pixel() -> None:
         *(("dots: 3", "whole number"), ("dots:7x", "whole number"), ("dots:7x14x3", "whole number")),
         *(("dots:4x17", "1 to 16"), ("hadamard:4x4", "whole number"), ("dots:", "use uniform")),
         *(("stripes:4", "use uniform"), ("Dots:4", "use uniform"), ("hadamard:32", "1 to 16")),
+        *(("hadamard:8:walsh", "order is 'walsh'; use natural, sequency, dyadic, cake-"), ("hadamard:8:", "is ''")),
+        *(("hadamard:12:dyadic", "powers of 2; use such, or hadamard:12"), ("dots:4:dyadic", "whole number")),
+        *(("hadamard::dyadic", "use uniform"), ("hadamard:32:natural", "1 to 16"), ("uniform:natural", "use uniform")),
     ],
 )
 def test_refusals_are_one_line_that_names_the_value(text: str, fragment: str) -> None:
@@ -146,7 +153,7 @@ for line in sys.argv[1:]:
             code = ended.code or 0
     done[line] = code, out.getvalue(), err.getvalue(), "numpy" in sys.modules
 from mitsim.report import label
-print(json.dumps([done, label("slats:3")]))
+print(json.dumps([done, [label("slats:3"), label("hadamard:8:dyadic")]]))
 """
 """A family that is registered, and nothing else, and command lines of it."""
 
@@ -176,7 +183,7 @@ def test_a_registered_family_is_known_to_the_command_line(tmp_path: Path) -> Non
         assert code == 2 and fragment in err and (not numpy_is_there or "--seed" in line), found[line]
     assert found[drawn][0] == 0, found[drawn]
     assert len([*(tmp_path / "p" / "patterns").glob("pattern_*")]) == 4
-    assert label == "9 broad slats"
+    assert label == ["9 broad slats", "64 Hadamard, dyadic"]
 
 
 def test_a_name_is_registered_once() -> None:

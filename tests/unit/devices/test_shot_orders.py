@@ -4,9 +4,11 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from scipy.linalg import hadamard
+from scipy.ndimage import label
 
 from mitsim.core.manifests import Patterns
-from mitsim.devices.patterns import hadamard_matrix, parse_patterns, shot_orders
+from mitsim.devices.patterns import ORDERS, Shot, hadamard_matrix, parse_patterns, shot_orders
 
 
 def _patterns(name: str, n: int = 16) -> Patterns:
@@ -44,24 +46,40 @@ def test_frames_in_the_order_of_loops_come_back_in_the_order_of_the_run(name: st
         assert [loops[order][k] for k in orders[order]] == shots, order
 
 
-@pytest.mark.parametrize("k", [2, 8, 16])
-def test_sequency_counts_sign_changes_and_dyadic_multiplies_rademacher_functions(k: int) -> None:
-    """Walsh's order is that of sign changes; number p of Paley's is the product of the square waves that p has bits of.
+def in_order(order: str, k: int) -> list[np.ndarray]:
+    """Patterns (k, k) of +-1 in an order, by its definition.
 
-    (Planted: s and s ^ (s >> 2) in place of the Gray code; natural order in place of sequency.)
+    Natural are the functions of scipy; sequency is the number of sign changes; number p of Paley's functions is the
+    product of the square waves that p has bits of; cakes are cut into the fewest connected blocks of one sign first.
     """
-    patterns, matrix = _patterns(f"hadamard:{k}"), hadamard_matrix(k)
-    orders, shots = shot_orders(patterns), patterns.captures
-    changes = [sum(a != b for a, b in pairwise(column)) for column in matrix.T.tolist()]
-    middles = (np.arange(k) + 0.5) / k
-    paley = []
+    natural = hadamard(k)
+    middles, paley = (np.arange(k) + 0.5) / k, []
     for p in range(k):
         waves = [np.sign(np.sin(2 * np.pi * 2**bit * middles)) for bit in range(8) if p >> bit & 1]
         paley.append(np.prod([np.ones(k), *waves], axis=0))
-    for order, series in (("sequency", matrix[:, np.argsort(changes)].T), ("dyadic", np.array(paley))):
-        taken = np.argsort(orders[order])  # the shot of each frame
-        shown = [np.outer(matrix[:, shots[shot].row], matrix[:, shots[shot].column]) for shot in taken[::2]]
-        assert np.array_equal(shown, [np.outer(left, right) for left in series for right in series]), order
+    walsh = sorted(natural, key=lambda function: sum(a != b for a, b in pairwise(function.tolist())))
+    series = {"sequency": walsh, "dyadic": paley}.get(order, natural)
+    patterns = [np.outer(left, right) for left in series for right in series]
+    if order == "cake-cutting":
+        patterns.sort(key=lambda pattern: label(pattern > 0)[1] + label(pattern < 0)[1])
+    return patterns
+
+
+@pytest.mark.parametrize("order", ORDERS)
+@pytest.mark.parametrize("k", [2, 8, 16])
+def test_the_orders_of_hadamard_patterns_are_those_of_their_definitions(k: int, order: str) -> None:
+    """Of frames that are imported, and of a family by its name, + before - in each pair.
+
+    (Planted: s and s ^ (s >> 2) in place of the Gray code; natural order in place of sequency; changes added in place
+    of multiplied blocks; ties of blocks by column; - before +.)
+    """
+    patterns, matrix = _patterns(f"hadamard:{k}"), hadamard_matrix(k)
+    taken = [patterns.captures[shot] for shot in np.argsort(shot_orders(patterns)[order])]
+    named = parse_patterns(f"hadamard:{k}:{order}", 16).shots
+    assert named == tuple(Shot(each.row, each.column, each.sign) for each in taken)
+    assert {shot.sign for shot in named[::2]} == {1} and {shot.sign for shot in named[1::2]} == {-1}
+    shown = [np.outer(matrix[:, shot.row], matrix[:, shot.column]) for shot in named[::2]]
+    assert np.array_equal(shown, in_order(order, k))
 
 
 def test_an_order_after_another_is_of_the_cameras_frames() -> None:
