@@ -433,7 +433,7 @@ def shot_orders(patterns: Patterns, taken: str | None = None) -> dict[str, npt.N
     import numpy as np
 
     row, column, sign = np.array([(shot.row, shot.column, shot.sign) for shot in patterns.captures]).T
-    walks = {"row-major": (row, column), "column-major": (column, row)}
+    walks: dict[str, tuple[Labels, ...]] = {"row-major": (row, column), "column-major": (column, row)}
     sizes = [side.shape[1] for side in patterns.matrices]
     squares = [side[:size] for side, size in zip(patterns.matrices, sizes, strict=True)]
     sylvester = all(size & (size - 1) == 0 for size in sizes)
