@@ -58,7 +58,10 @@ class Reconstructing(ImageRequest, Pictured):
     output: Path | None = to_make(None, "folder to make for the image", "DIR", show_default="RUN/reconstruction")
     calibration: Path | None = option(None, "calibration folder; required unless --psf is given", metavar="CAL")
     psf: Path | None = option(
-        None, "measured point spread function, a picture, in place of a calibration", metavar="FILE"
+        None,
+        "measured point spread function, a picture, in place of a calibration; for coloured runs with one channel, or "
+        "one for each line",
+        metavar="FILE",
     )
     reduce: int = option(1, "only with --psf: average blocks of K x K pixels", min=1, metavar="K")
     chart: str | None = option(
@@ -73,8 +76,8 @@ class Reconstructing(ImageRequest, Pictured):
         run = lines.folder
         if self.psf is not None:
             self.refuse(["calibration", "chart"], "with --psf")
-            if lines.colours:
-                raise MitsimError(f"--psf {self.psf}: {run} is coloured; reconstruct one of its lines, {run}/NAME")
+            if lines.filters:
+                raise MitsimError(f"--psf {self.psf}: {run} has the frames of a mosaic in one; use a calibration")
             self.check_point_spread(self.reduce)
             if not self.psf.is_file():
                 raise MitsimError(f"--psf {self.psf}: is no file; give a picture of the light of a scene point")
@@ -130,7 +133,9 @@ def reconstruct(asked: Reconstructing) -> int:
             options = {"lam": asked.lam}
         where: Any = {"output": output, "overwrite": asked.overwrite, "job": job, **options}
         found: Any
-        if asked.psf is not None:
+        if asked.psf is not None and lines.colours:
+            found = reconstruct_run.reconstruct_colours(run, asked.psf, reduce=asked.reduce, page=False, **where)
+        elif asked.psf is not None:
             found = reconstruct_run.reconstruct_psf(run, asked.psf, reduce=asked.reduce, **where)
         elif lines.colours:
             found = reconstruct_run.reconstruct_colours(run, calibration, chart=chart, page=False, **where)
@@ -360,6 +365,7 @@ def import_(asked: Importing) -> int:
 
     $ mitsim import frames -o run --list mine.toml --calibration cal
     $ mitsim import hand.png -o hand --list diffusercam
+    $ mitsim import point --point -o psf.npy --list diffusercam --dark-frame dark
     $ mitsim import run.h5 -o copy --calibration-output cal
     """
     source, output, calibration = asked.source, asked.output, asked.calibration_output
@@ -372,8 +378,16 @@ def import_(asked: Importing) -> int:
     elif output is None or calibration is not None:
         raise MitsimError(f"{source}: frames contain no calibration; give -o RUN, and leave out --calibration-output")
     else:
+        replaces = bool(asked.point and asked.overwrite)
         with asked.job() as job:
-            payload = mitsim.import_frames(source, output, job, **facts)
+            payload = mitsim.import_frames(source, output, job, overwrite=replaces, **facts)
+    if payload["holds"] == ["psf"]:
+        import numpy as np
+
+        light = np.load(payload["output"])
+        light = light.mean(axis=2) if light.ndim == 3 else light
+        lines = [payload["headline"], f"Point spread function: {output}", *payload["notes"]]
+        return asked.finish_frame((Path(payload["output"]), light, "electrons/s"), {**payload, "report": None}, lines)
     lines = [f"Run: {payload['output']}"] if payload["output"] else []
     if payload["calibration_output"]:
         lines.append(f"Calibration: {payload['calibration_output']}")

@@ -111,9 +111,9 @@ class MosaicManifest(ColourManifest):
         return self
 
 
-def lines_of_planes(kind: str, wavelengths_nm: tuple[float, ...]) -> ColourManifest:
+def lines_of_planes(kind: str, wavelengths_nm: tuple[float, ...], names: tuple[str, ...] = PLANES) -> ColourManifest:
     lengths = dict(zip("rgb", wavelengths_nm, strict=True))
-    lines = [{"name": name, "wavelength_nm": lengths[name[0]]} for name in PLANES]
+    lines = [{"name": name, "wavelength_nm": lengths[name[0]]} for name in names]
     return validate(ColourManifest, {"kind": kind, "channels": lines}, "planes")
 
 

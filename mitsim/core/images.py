@@ -49,7 +49,7 @@ Numbers = npt.NDArray[Any]
 _PNG_BITS = {"1": 1, "L;2": 2, "L;4": 4, "L": 8, "I;16B": 16}
 """Bits of a grey PNG by Pillow's mode."""
 _COLOURS_A_PIXEL = 3, 4
-_COLOURS = "RGB", "RGBA"
+_COLOURS = "RGB", "RGBA", "RGB;16B", "RGBA;16B"
 _ORIENTATION = 274
 """Tag of TIFF and Exif."""
 _NO_PAGE = 0b101
@@ -80,6 +80,12 @@ _Reader = Iterator[Any]
 
 def image_pages(path: Path | str, wanted: Wanted = FRAME) -> tuple[int, tuple[int, int]]:
     """Return pages, and rows and columns of the first page, from the header."""
+    pages, (rows, columns, *_) = image_header(path, wanted)
+    return pages, (rows, columns)
+
+
+def image_header(path: Path | str, wanted: Wanted = FRAME) -> tuple[int, tuple[int, ...]]:
+    """Return pages, and rows, columns and, in colour, numbers a pixel of the first page, from the header."""
     with _one_line_refusals(Path(path), wanted):
         (pages, size, _), _ = _read_header(Path(path), wanted)
         return pages, size
@@ -117,14 +123,14 @@ def own_end(values: Numbers) -> float | None:
     return float(np.iinfo(values.dtype).max) if values.dtype.kind == "u" and values.dtype.itemsize < 4 else None
 
 
-def _read_header(path: Path, wanted: Wanted) -> tuple[tuple[int, tuple[int, int], float], Iterator[Numbers]]:
+def _read_header(path: Path, wanted: Wanted) -> tuple[tuple[int, tuple[int, ...], float], Iterator[Numbers]]:
     check_plain(path, wanted.what)
     ending = path.suffix.lower()
     if ending not in _READERS:
         raise wanted.refusal(path, f"ends in {ending or 'nothing'}; read are {', '.join(_READERS)}")
     numbers = _READERS[ending](path, wanted)
     header = next(numbers)
-    _check_size(path, wanted, *header[1])
+    _check_size(path, wanted, *header[1][:2])
     return header, numbers
 
 
@@ -148,14 +154,21 @@ def _png(path: Path, wanted: Wanted) -> _Reader:
             raise wanted.refusal(path, f"is an animated PNG of several; give each {wanted.what} a file of its own")
         stored = str(picture.tile[0][3]) if picture.tile else ""
         bits = _PNG_BITS.get(stored, 0)
-        if bits not in wanted.bits and not (wanted.colour and stored in _COLOURS):
+        colours = (picture.mode,) if wanted.colour and stored in _COLOURS else ()
+        if bits not in wanted.bits and not colours:
             known = (count for count in wanted.bits if count in _PNG_BITS.values())
             raise wanted.refusal(path, f"is no {_allowed_kinds('PNG', known, wanted)}")
-        yield 1, picture.size[::-1], _PIXEL_BYTES
+        yield 1, (*picture.size[::-1], *map(len, colours)), _PIXEL_BYTES
         if "transparency" in picture.info:
             raise wanted.refusal(path, "names a number that is transparent; save it without transparency")
         # Some versions of Pillow give 16 bits of a PNG as 32.
         values = np.array(picture).astype(bool if bits == 1 else np.uint8 if bits <= 8 else np.uint16)
+        if stored.endswith(";16B") and colours:
+            # Pillow keeps the high byte of colours. As if the bytes were swapped, it gives the low one.
+            file.seek(0)
+            low = PngImageFile(file)
+            low.tile = [(*low.tile[0][:3], f"{stored[:-1]}L")]  # type: ignore[list-item]
+            values = values.astype(np.uint16) << 8 | np.array(low)
         _check_upright(path, picture.getexif().get(_ORIENTATION, _UPRIGHT), wanted)  # perhaps behind its pixels
         yield values
 
@@ -181,7 +194,7 @@ def _tiff(path: Path, wanted: Wanted) -> _Reader:
     def check(page: Any) -> None:
         bits, kind = page.bitspersample, page.photometric
         grey = kind == _BLACK_IS_ZERO and page.samplesperpixel == 1 and page.ndim == 2 and bits in wanted.bits
-        colour = wanted.colour and kind == _RGB and page.ndim == 3 and bits == 8
+        colour = wanted.colour and kind == _RGB and page.ndim == 3 and page.planarconfig == 1 and bits in (8, 16, 32)
         if page.dtype is None or page.dtype.kind not in "buif" or not (grey or colour):
             raise wanted.refusal(path, f"is no {_allowed_kinds('TIFF', wanted.bits, wanted)}")
         if int(page.subfiletype) & _NO_PAGE or page.subifds:
@@ -197,7 +210,7 @@ def _tiff(path: Path, wanted: Wanted) -> _Reader:
         if not 0 < len(pages) <= _MOST_PAGES:
             raise wanted.refusal(path, f"has {len(pages)} pages; give 1 to {_MOST_PAGES}")
         check(pages[0])
-        yield len(pages), pages[0].shape[:2], _PIXEL_BYTES
+        yield len(pages), pages[0].shape, _PIXEL_BYTES
         for page in pages:
             check(page)
             yield page.asarray()
@@ -210,13 +223,14 @@ def _npy(path: Path, wanted: Wanted) -> _Reader:
         if len(shape) not in (2, 3) or dtype.kind not in kinds:
             payload = f"{dtype} of shape {shape}"
             raise wanted.refusal(path, f"holds {payload}; rows x columns of numbers are needed, or pages of them")
-        if len(shape) == 3 and sides[1] in _COLOURS_A_PIXEL:
+        colours = len(shape) == 3 and sides[1] in _COLOURS_A_PIXEL
+        if colours and not wanted.colour:
             kind = f"{shape[0]} x {shape[1]} pixels of {shape[2]} numbers, as of red, green and blue"
             raise wanted.refusal(path, f"holds {kind}; {wanted.grey}")
-        pages = shape[0] if len(shape) == 3 else 1
-        yield pages, sides, pages * dtype.itemsize + _PIXEL_BYTES
+        pages = shape[0] if len(shape) == 3 and not colours else 1
+        yield pages, shape if colours else sides, pages * dtype.itemsize + _PIXEL_BYTES
         values = np.load(file, allow_pickle=False)
-        yield from values if len(shape) == 3 else [values]
+        yield from values if len(shape) == 3 and not colours else [values]
 
 
 def _exr(path: Path, wanted: Wanted) -> _Reader:
@@ -302,7 +316,7 @@ _READERS: dict[str, Callable[[Path, Wanted], _Reader]] = {
 
 def _allowed_kinds(kind: str, bits: Any, wanted: Wanted) -> str:
     *most, last = (str(count) for count in bits)
-    colours = ", nor of red, green and blue of 8 bits" if wanted.colour else ""
+    colours = ", nor of red, green and blue of 8 or 16 bits, pixel by pixel" if wanted.colour else ""
     zero = " whose zero is black" if kind == "TIFF" else ""
     return f"grey {kind} of {', '.join(most)} or {last} bits{zero}{colours}; {wanted.grey}"
 
@@ -400,6 +414,8 @@ class Preparer:
     def plane(self, values: Numbers) -> Numbers:
         if self.how.channel is None:
             return values
+        if values.ndim == 3:
+            return values[..., "rgb".index(self.how.channel[0])]
         row, column = planes_of(self.how.mosaic or BGGR)[self.how.channel]
         return values[row::2, column::2]
 

@@ -30,6 +30,8 @@ PIXEL_FORMATS: dict[PixelFormat, tuple[int, int]] = {
 _Side = Annotated[int, Field(ge=1, le=MOST_SIDE)]
 _Place = Annotated[int, Field(ge=0, lt=MOST_SIDE)]
 PLANES = ("r", "gb", "gr", "b")
+RGB = ("r", "g", "b")
+"""Channels of a picture in colour."""
 """FlatCam's names: gb is the green plane in the rows of blue pixels."""
 ALL = "all"
 WAVELENGTHS_NM = 600.0, 540.0, 460.0

@@ -156,7 +156,7 @@ class Capture:
             own = light * shot.sign if shot.sign else self._projector_part(light)
             top, end = float(dn.max()), digital.saturation_dn
             full = int(np.count_nonzero(dn >= end)) if end is not None and top >= end else 0
-            clipped = 0 if full else _clipped_readings(dn, top, digital)
+            clipped = 0 if full else clipped_readings(dn, top, digital)
             # Identical frames share a digest; constant frames have none.
             some = np.ascontiguousarray(dn[::_EVERY, ::_EVERY])
             digest = 0 if (some == some.flat[0]).all() else 1 + zlib.crc32(some.tobytes())
@@ -334,7 +334,7 @@ def load_run(folder: Path | str) -> Capture:
     return Capture(manifests.read_manifest(Path(folder), RunManifest), Path(folder))
 
 
-def _clipped_readings(dn: FloatArray, top: float, digital: Digital) -> int:
+def clipped_readings(dn: FloatArray, top: float, digital: Digital) -> int:
     """Return the number of readings at the largest number, ``top``, if noise makes so many unlikely; else 0.
 
     Without clipping, a frame's largest number is not more frequent than the numbers just below it.

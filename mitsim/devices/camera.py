@@ -6,11 +6,11 @@ Coordinates are index coordinates (``s_row = -y``, ``s_col = -x``) in mm, centre
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import Literal, cast, get_args
+from typing import Any, Literal, cast, get_args
 
 import numpy as np
 from pydantic import Field, field_validator, model_validator
@@ -22,7 +22,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.files import FRAME_LIMITS, fits_a_frame
 from mitsim.core.images import image_pages, own_end, read_image
 from mitsim.core.job import Cost, Limits
-from mitsim.core.picture_files import Wanted
+from mitsim.core.picture_files import BGGR, PLANES, Wanted, planes_of
 from mitsim.core.seeds import stream
 from mitsim.devices.mask import FEW, LARGEST, NO_FLAWS, CameraMask, Flaws, Mask, MaskKind, Plate, mls_mask, within
 from mitsim.devices.patterns import is_prime
@@ -524,7 +524,7 @@ def make_square(values: FloatArray, feature_mm: float) -> tuple[float, FloatArra
 _PICTURE = Wanted("point spread function", colour=True)
 _PIXEL_BYTES = 64
 """Memory of a pixel: four colours of double precision, and as many arrays of their mean."""
-_BORDER = 16
+PSF_BORDER = 16
 """Width [pixels] of the frame along the picture's edges that shows the background."""
 
 
@@ -536,25 +536,59 @@ def load_psf(path: Path | str, reduce: int = 4, most: int | None = None) -> Floa
     pixels per side, for a ``reduce`` that does not fit, and without light above the background.
     """
     path = Path(path)
+    light = _light(path, _read(path, reduce, most).mean(axis=2), reduce)
+    return np.asarray(light / light.sum())
+
+
+def load_psf_channels(
+    path: Path | str, names: Sequence[str], frame: tuple[int, int], how: Mapping[str, Any], reduce: int = 1
+) -> FloatArray:
+    """Return the light (channels, k, k') of a point in a picture, a channel for each line of a run, or one for all.
+
+    A run of the planes of a mosaic takes a raw mosaic of twice the rows and columns of its ``frame``, too, whose planes
+    are read as ``how`` (:class:`mitsim.core.picture_files.Preparation`) says. MitsimError as :func:`load_psf`, and for
+    other numbers of channels.
+    """
+    path = Path(path)
+    values = np.moveaxis(_read(path, reduce), 2, 0)
+    if len(values) not in (1, len(names)):
+        lines = f"and the run has {len(names)} lines, {', '.join(names)}"
+        raise _PICTURE.refusal(
+            path, f"has {len(values)} channels, {lines}; give a channel for each line, or one for all"
+        )
+    rows, columns = values.shape[1:]
+    if len(values) == 1 and tuple(names) == PLANES and (rows > frame[0] or columns > frame[1]):
+        if (rows, columns) != (2 * frame[0], 2 * frame[1]) or "orientation" in how or min(frame) <= 2 * PSF_BORDER:
+            needed = f"a raw mosaic of the run's {frame[0]} x {frame[1]} pixels a plane has twice as many, not rotated"
+            raise _PICTURE.refusal(path, f"{rows} x {columns} pixels; {needed}; import it with --point as the frames")
+        values = np.stack([values[0, a::2, b::2] for a, b in planes_of(how.get("mosaic") or BGGR).values()])
+    return np.stack([_light(path, each, reduce) for each in values])
+
+
+def _read(path: Path, reduce: int, most: int | None = None) -> FloatArray:
+    """Return the (rows, columns, channels) numbers of a picture without transparency, as :func:`load_psf` checks it."""
     size = image_pages(path, _PICTURE)[1]
     rows, columns = (side // reduce for side in size) if reduce >= 1 else (0, 0)
-    if min(rows, columns) < 1 or min(size) <= 2 * _BORDER:
-        problem = f"{size[0]} x {size[1]} pixels, reduce {reduce}; it needs more than {2 * _BORDER} pixels a side"
+    if min(rows, columns) < 1 or min(size) <= 2 * PSF_BORDER:
+        problem = f"{size[0]} x {size[1]} pixels, reduce {reduce}; it needs more than {2 * PSF_BORDER} pixels a side"
         raise _PICTURE.refusal(path, f"{problem}, and reduce from 1 to its shorter side")
     if most is not None and max(rows, columns) > most:
         raise _PICTURE.refusal(path, f"{rows} x {columns} pixels; a mask has at most {most} a side, set psf_reduce")
     Cost(memory_bytes=size[0] * size[1] * _PIXEL_BYTES).check(f"point spread function {path}", Limits())
-    values = np.asarray(read_image(path, _PICTURE), dtype=np.float64)
-    values = values if values.ndim == 2 else values[..., :3].mean(axis=2)
+    values = np.atleast_3d(np.asarray(read_image(path, _PICTURE), dtype=np.float64))
+    return values if path.suffix.lower() == ".npy" else values[..., :3]
+
+
+def _light(path: Path, values: FloatArray, reduce: int) -> FloatArray:
+    rows, columns = (side // reduce for side in values.shape)
     inside = np.zeros(values.shape, dtype=bool)
-    inside[_BORDER:-_BORDER, _BORDER:-_BORDER] = True
+    inside[PSF_BORDER:-PSF_BORDER, PSF_BORDER:-PSF_BORDER] = True
     above = values - np.median(values[~inside])
     means = above[: rows * reduce, : columns * reduce].reshape(rows, reduce, columns, reduce).mean(axis=(1, 3))
     light = np.maximum(means, 0)
-    total = float(light.sum())
-    if total <= 0:
+    if light.sum() <= 0:
         raise _PICTURE.refusal(path, "nothing is brighter than its edges; give another picture")
-    return np.asarray(light / total)
+    return np.asarray(light)
 
 
 # -------- The devices of a bench, as pure data

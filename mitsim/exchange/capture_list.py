@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -117,7 +117,8 @@ class RealCapture:
     """Facts about a real capture; None: as ``listed`` states.
 
     ``calibration`` is a CAL folder of the same camera, coloured for all planes, which states identity and projector
-    pixels.
+    pixels. The files are ``rgb`` if their pixels have three numbers, of which each is a line. Frames of a ``point``
+    source have no patterns.
     """
 
     listed: CaptureList
@@ -125,6 +126,8 @@ class RealCapture:
     exposure_s: float | None = None
     calibration: Path | None = None
     black_level_dn: float | None = None
+    rgb: bool = False
+    point: bool = False
 
     @property
     def patterns(self) -> str:
@@ -137,7 +140,7 @@ class RealCapture:
         """Raise ArgumentError that names all facts that neither options nor the list state."""
         listed, named = self.listed, self.camera is None and self.listed.camera is not None
         known = {
-            "patterns": listed.patterns is not None,
+            "patterns": listed.patterns is not None or self.point,
             "camera": self.camera is not None or (named and listed.digital is not None),
             "exposure": self.exposure_s is not None or (named and listed.digital is not None),
         }
@@ -147,15 +150,32 @@ class RealCapture:
 
     @property
     def wanted(self) -> Wanted:
-        return Wanted(raw=self.listed.raw)
+        return Wanted(raw=self.listed.raw, colour=True)
 
     @property
     def colours(self) -> ColourManifest | None:
         """Return all planes as lines of a coloured folder; None for a single plane, or a picture without mosaic."""
         prepare = self.listed.prepare
-        if prepare.channel != picture_files.ALL:
+        if prepare.channel != picture_files.ALL and not self.rgb:
             return None
-        return colour_files.lines_of_planes(colour_files.RUN, prepare.wavelengths_nm)
+        names = picture_files.RGB if self.rgb else picture_files.PLANES
+        return colour_files.lines_of_planes(colour_files.RUN, prepare.wavelengths_nm, names)
+
+    def of_file(self, path: Path, size: tuple[int, ...]) -> RealCapture:
+        """Return the capture with ``rgb`` as the ``size`` of a file says; MitsimError if options do not fit that."""
+        if len(size) == 2:
+            return self
+        if size[2] != len(picture_files.RGB):
+            raise MitsimError(f"{path}: has {size[2]} numbers a pixel; save red, green and blue alone")
+        prepare = self.listed.prepare
+        for name, value in ("mosaic", prepare.mosaic), ("channel", prepare.channel):
+            if value is not None:
+                raise ArgumentError(
+                    name, f"{value}: {path} is no mosaic but in colour, all of which is read; leave it out"
+                )
+        known = replace(self, rgb=True)
+        known.check(path)
+        return known
 
     def electronics(self) -> tuple[Electronics, Preparation]:
         """Return camera and preparation with its mosaic; MitsimError if neither file nor list has them."""
@@ -191,7 +211,7 @@ class RealCapture:
                 raise ArgumentError("closing_exposure", said)
         self.electronics()
         folder, colours = self.calibration, self.colours
-        if folder is None and listed.n is None:
+        if folder is None and listed.n is None and not self.point:
             needed = "is not given, and patterns need its projector; give it, or --projector-pixels"
             raise ArgumentError("calibration", needed)
         if folder is not None and colours is not None:
@@ -210,9 +230,9 @@ class RealCapture:
                     f"calibration {part}: is of frames turned by {turned} degrees, not by {prepare.turn_deg:g}; "
                     f"give --turn {turned}"
                 )
-        if self.patterns.endswith(".json"):
+        if not self.point and self.patterns.endswith(".json"):
             check_plain(self.patterns)
-        else:
+        elif not self.point:
             read_name(self.patterns, listed.n)
         for place in (source, *(getattr(prepare, name) for name in CORRECTIONS)):
             if place is not None:
@@ -229,6 +249,11 @@ _FIELDS = {
 """Fields of a list, or of its preparation, by the option of another name that replaces each."""
 _OWN = {"camera", "bits", "crop"}
 """Options whose fields of the same name have another meaning or form."""
+_OF_PATTERNS = (
+    *("patterns", "calibration", "projector_pixels", "ambient_frame", "ambient_shots"),
+    *("closing_frame", "closing_exposure", "order", "seed"),
+)
+"""Options without effect on frames of a point source."""
 LISTS, CAMERAS, PROJECTORS = (
     partial(configuration.shipped_names, field)
     for field in (configuration.LIST, configuration.CAMERA, configuration.PROJECTOR)
@@ -284,6 +309,9 @@ class FrameFacts(Options):
         "part of the frames to keep, after all rotations", metavar="ROW,COLUMN[,ROWS,COLUMNS]"
     )
     seed: int | None = said("only for random patterns: seed of their random numbers")
+    point: bool | None = said(
+        "all frames show one point source: stack them to a point spread function, a file .npy for `reconstruct --psf`"
+    )
 
     def of(self, source: Path) -> RealCapture:
         bare = any(
@@ -320,8 +348,11 @@ class FrameFacts(Options):
         known["prepare"] = validate(Preparation, prepare, "import")
         calibration = None if self.calibration is None else Path(self.calibration)
         listed = validate(CaptureList, known, "import")
-        capture = RealCapture(listed, given.get("camera"), self.exposure, calibration, self.black_level)
-        if not takes_seed(capture.patterns):
+        point = bool(self.point)
+        if point:
+            self.refuse(_OF_PATTERNS, "on frames of a point source")
+        capture = RealCapture(listed, given.get("camera"), self.exposure, calibration, self.black_level, point=point)
+        if not point and not takes_seed(capture.patterns):
             self.refuse(("seed",), "on patterns that are not drawn at random")
         capture.check(source)
         return capture

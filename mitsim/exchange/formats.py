@@ -218,17 +218,21 @@ def _frames_of(run: Run) -> int:
 
 
 @takes(FrameFacts)
-def import_frames(source: Path | str, output: Path | str, job: Job | None = None, **known: Any) -> dict[str, Any]:
-    """Make a RUN folder from a real camera's frames, whole or not at all.
+def import_frames(
+    source: Path | str, output: Path | str, job: Job | None = None, overwrite: bool = False, **known: Any
+) -> dict[str, Any]:
+    """Make a RUN folder from a real camera's frames, whole or not at all, or with ``point`` an NPY file.
 
     Parameters
     ----------
     source
         Folder of frames, sorted by the numbers in their names; or one file.
     output
-        RUN folder to create.
+        RUN folder to create; with ``point`` a file that ends in .npy.
     job
         Its command line is recorded in the manifest; None: called from Python.
+    overwrite
+        With ``point``, whether an earlier file is replaced.
 
     Returns
     -------
@@ -244,6 +248,12 @@ def import_frames(source: Path | str, output: Path | str, job: Job | None = None
         a place that holds something.
     """
     facts = FrameFacts(**known).of(Path(source))
+    if facts.point:
+        from mitsim.exchange.point_source import stack_point
+
+        return stack_point(Path(source), Path(output), facts, overwrite)
+    if overwrite:
+        raise ArgumentError("overwrite", "replaces files of a point source alone; remove the earlier run")
     from mitsim.exchange.packed import import_capture
 
     return import_capture(Path(source), Path(output), facts, None if job is None else job.command)

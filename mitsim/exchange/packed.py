@@ -36,7 +36,7 @@ from mitsim.core.files import (
     write_text,
 )
 from mitsim.core.headline import each_once, frames_headline
-from mitsim.core.images import LEAST_RESPONSE, CommonFactor, Numbers, Preparer, image_pages, read_images, size_of
+from mitsim.core.images import LEAST_RESPONSE, CommonFactor, Numbers, Preparer, image_header, read_images, size_of
 from mitsim.core.job import Cost, Limits
 from mitsim.core.picture_files import CORRECTIONS, Preparation, image_files
 from mitsim.core.runs import AMBIENT, CLOSING, TRUTH, frame_name, load_run
@@ -402,6 +402,8 @@ def hdf5_item(parent: h5py.Group, name: str, path: Path, kind: str = "Dataset") 
 
 _SECONDS_PER_PIXEL = 1e-7
 """Every frame is read twice and written once: 30 s for 256 megapixels on a slow disk."""
+_PLANE = {"g": "gb"}
+"""Plane of a mosaic that the green of a picture in colour counts as."""
 LEFT_OUT = ("truth", "scene", "expected electrons", "plan and predicted error")
 """Parts of a run that are unknown for a real capture."""
 
@@ -414,6 +416,8 @@ def import_capture(source: Path, output: Path, known: RealCapture, command: str 
     """
     known.check(source)
     files = image_files(source, known.wanted)
+    pages = {path: image_header(path, known.wanted) for path in files}
+    known = known.of_file(files[0], pages[files[0]][1])
     camera, prepare = known.electronics()
     colours, listed = known.colours, known.listed
     planes = [_Plane(known, camera, name) for name in (colours.names if colours else ("",))]
@@ -421,7 +425,6 @@ def import_capture(source: Path, output: Path, known: RealCapture, command: str 
     orders, count, order, closing = shot_orders(shown), len(shown.captures), listed.order, listed.closing_frame
     if order is not None and order not in orders:
         raise ArgumentError("order", f"{cut(repr(order))}: give {', '.join(orders)}")
-    pages = {path: image_pages(path, known.wanted) for path in files}
     if (held := sum(number for number, _ in pages.values())) != count + bool(closing):
         last = " and a closing frame" if closing else ""
         hint = "; if the last one is a closing frame, give --closing-frame" if held == count + 1 else ""
@@ -433,35 +436,13 @@ def import_capture(source: Path, output: Path, known: RealCapture, command: str 
     pixels = sum(number * math.prod(size) for number, size in pages.values())
     cost = Cost(seconds=pixels * _SECONDS_PER_PIXEL, disk_bytes=pixels * np.dtype(np.uint32).itemsize)
     cost.check(f"import of {count} frames", Limits(), output)
-    first, common = np.empty(0), CommonFactor()
-    places, notes, warnings = list[tuple[Path, int]](), list[str](), list[str]()
-    for path in files:
-        for number, frame in enumerate(read_images(path, known.wanted)):
-            first = first if places else frame
-            if frame.shape != first.shape:
-                raise MitsimError(
-                    f"{path}: is {size_of(frame)}, but {files[0].name} {size_of(first)}; give frames of one size"
-                )
-            places.append((path, number))
-            common.add(frame)
-    factor = prepare.divide_by
-    if factor is None:
-        factor = common.choose(camera.largest)
-        if factor > 1:
-            notes.append(f"numbers are divided by {factor}, because all are multiples of it")
-        elif common.factor > 1:
-            warnings.append(
-                f"all numbers are multiples of {common.factor}, and are used unchanged: if the camera's numbers were "
-                f"shifted or scaled, give --divide {common.factor}, else --divide 1"
-            )
-    elif common.factor % factor:
-        raise ArgumentError("divide_by", f"{factor}: the numbers' common factor is {common.factor}; give that, or 1")
+    found = survey(files, known, camera, prepare)
+    places, notes, warnings, runs = found.places, found.notes, found.warnings, {}
     if order is not None:
         places[:count] = [places[frame] for frame in orders[order]]
-    prepare, runs = prepare.model_copy(update={"divide_by": factor}), {}
     for plane in planes:
-        how = prepare.model_copy(update={"channel": plane.name}) if plane.name else prepare
-        runs[plane.name], shape, unlit = plane.pack(how, source, places, first, command)
+        how = found.of_line(plane.name)
+        runs[plane.name], shape, unlit = plane.pack(how, source, places, found.first, command)
         if unlit:
             warnings.append(
                 f"flat: {unlit} pixels{f' of {plane.name}' if plane.name else ''} have less than {LEAST_RESPONSE:g} of "
@@ -485,14 +466,59 @@ def import_capture(source: Path, output: Path, known: RealCapture, command: str 
         "calibration_output": None,
         "holds": ["run"],
         "left_out": [*LEFT_OUT],
-        "divided_by": factor,
+        "divided_by": found.prepare.divide_by,
         "planes": [name for name in runs if name],
         "notes": notes,
         "warnings": warnings,
     }
 
 
-def _check_range(path: Path, frame: Numbers, camera: Electronics, factor: int, mean: bool = False) -> None:
+@dataclass(frozen=True, eq=False)
+class Surveyed:
+    """First of several frames, the ``places`` of all (file and page), and their preparation with the common factor."""
+
+    first: Numbers
+    places: list[tuple[Path, int]]
+    prepare: Preparation
+    notes: list[str]
+    warnings: list[str]
+
+    def of_line(self, name: str) -> Preparation:
+        """Return the preparation of a line; "" is the whole picture."""
+        return self.prepare.model_copy(update={"channel": _PLANE.get(name, name)}) if name else self.prepare
+
+
+def survey(files: Sequence[Path], known: RealCapture, camera: Electronics, prepare: Preparation) -> Surveyed:
+    """Read all frames once; MitsimError if their sizes differ, or for another factor than is stated."""
+    first, common = np.empty(0), CommonFactor()
+    places, notes, warnings = list[tuple[Path, int]](), list[str](), list[str]()
+    for path in files:
+        for number, frame in enumerate(read_images(path, known.wanted)):
+            first = first if places else frame
+            if frame.shape != first.shape:
+                raise MitsimError(
+                    f"{path}: is {size_of(frame)}, but {files[0].name} {size_of(first)}; give frames of one size"
+                )
+            places.append((path, number))
+            common.add(frame)
+    factor = prepare.divide_by
+    if factor is None:
+        factor = common.choose(camera.largest)
+        if factor > 1:
+            notes.append(f"numbers are divided by {factor}, because all are multiples of it")
+        elif common.factor > 1:
+            warnings.append(
+                f"all numbers are multiples of {common.factor}, and are used unchanged: if the camera's numbers were "
+                f"shifted or scaled, give --divide {common.factor}, else --divide 1"
+            )
+    elif common.factor % factor:
+        raise ArgumentError("divide_by", f"{factor}: the numbers' common factor is {common.factor}; give that, or 1")
+    if known.rgb:
+        notes.append("numbers of red, green and blue are read as stored: a gamma curve in them is not undone")
+    return Surveyed(first, places, prepare.model_copy(update={"divide_by": factor}), notes, warnings)
+
+
+def check_range(path: Path, frame: Numbers, camera: Electronics, factor: int, mean: bool = False) -> None:
     """Raise MitsimError if numbers, divided by a factor, are none of the camera; ``mean`` marks means of frames."""
     largest, low, high, kind = camera.largest, float(frame.min()), float(frame.max()), frame.dtype
     if largest is None:
@@ -581,7 +607,7 @@ class _Plane:
         names = (
             *(shot.file for shot in captures), *((AMBIENT,) if ambient else ()), *((CLOSING,) if closing else ()),
         )  # fmt: skip
-        own = camera.identity | ({} if listed.prepare.channel == how.channel else {"channel": how.channel})
+        own = camera.identity | ({} if listed.prepare.channel == how.channel else {"channel": self.name})
         more = () if listed.ambient is None else image_files(Path(listed.ambient), known.wanted)
         corrected = {
             name: {path.name: checksum(path) for path in image_files(Path(place), known.wanted)}
@@ -595,7 +621,7 @@ class _Plane:
             **camera.stated,
             "exposure_s": camera.digital.exposure_s,
             "black_level_dn": known.black_level_dn,
-            "channel": how.channel,
+            "channel": self.name or how.channel,
             "prepare": {**how.model_dump(mode="json", exclude_defaults=True), **corrected},
             "seed": listed.seed,
             **listed.model_dump(include={"closing_frame", "closing_exposure_s", "order"}, exclude_none=True),
@@ -631,7 +657,7 @@ class _Plane:
             following = path, page + 1
             if (values := next(pages, None)) is None:
                 raise MitsimError(f"{path}: has fewer frames than before; leave it alone while it is read")
-            _check_range(path, values, camera, how.divide_by or 1)
+            check_range(path, values, camera, how.divide_by or 1)
             made = (of_last if name == CLOSING else preparer).frame(path, values)
             channels = {"DN": cast(Channel, np.array(self._part(path, made, how), kind))}  # parts do not keep pictures
             if name == CLOSING:
@@ -659,7 +685,7 @@ class _Plane:
         total, count, stated = np.zeros(shape), 0, self.known.listed.ambient_shots
         for path in image_files(source, self.known.wanted):
             for frame in read_images(path, self.known.wanted):
-                _check_range(path, frame, self.camera, preparer.how.divide_by or 1, mean=True)
+                check_range(path, frame, self.camera, preparer.how.divide_by or 1, mean=True)
                 part = self._part(path, preparer.frame(path, frame, mean=True), preparer.how)
                 if part.shape != shape:
                     raise MitsimError(f"{path}: is {size_of(part)}, but others are {size_of(shape)}")

@@ -223,6 +223,17 @@ class ColourModel:
         free = np.linalg.lstsq(values @ basis, chart().xyz - values @ even.T, rcond=None)[0]
         return cls(tuple(map(float, wavelengths_nm)), np.asarray(even + free.T @ basis.T), fitted_on)
 
+    @classmethod
+    def of_channels(cls, names: Sequence[str], wavelengths_nm: Sequence[float], white: FloatArray) -> ColourModel:
+        """Return the conversion of lines of which ``white`` is white: r, g and b are sRGB's, others spectral lines."""
+        if {name[0] for name in names} == {*"rgb"}:
+            rows = np.array([[name[0] == each for name in names] for each in "rgb"], dtype=np.float64)
+            screen = np.linalg.inv(_colour().RGB_COLOURSPACES["sRGB"].matrix_XYZ_to_RGB)
+            matrix = screen @ (rows / rows.sum(axis=1, keepdims=True))
+        else:
+            matrix = cls.of_lines(wavelengths_nm).matrix
+        return cls(tuple(map(float, wavelengths_nm)), np.asarray(matrix / white), "the light of the point as white")
+
     def xyz(self, reflectances: npt.ArrayLike) -> FloatArray:
         return np.asarray(np.asarray(reflectances, dtype=np.float64) @ self.matrix.T)
 

@@ -483,6 +483,15 @@ def find_fit(light: ShiftedLight, frames: Array, variance: float | None) -> Poin
 # ---- The image -------------------------------------------------------------------------------------------------------
 
 
+def automatic_weight(light: ShiftedLight, frames: Array, method: str) -> float:
+    """Return lambda, or the weight of the total variation, for ``frames`` (K K', m, m')."""
+    if method == TV:
+        return _WEIGHT * frame_error(light, frames) * math.sqrt(light.column_power)
+    if light.patterns is None:
+        return _RIDGE * frame_error(light, frames) / float(frames.mean()) * light.column_power
+    raise MitsimError("lambda auto: is chosen under uniform light alone; under patterns give lambda as a number")
+
+
 def solve_point_spread(
     light: ShiftedLight,
     frames: Array,
@@ -498,14 +507,7 @@ def solve_point_spread(
         raise MitsimError(f"iterations are {iterations}; give at least 1")
     prior = Prior(bounds=bounds or (Prior.bounds if method == TIKHONOV else (0.0, math.inf)))
     frames = frames.astype(light.precision)
-    if lam != "auto":
-        known = check_lambda(lam)
-    elif method == TV:
-        known = _WEIGHT * frame_error(light, frames) * math.sqrt(light.column_power)
-    elif light.patterns is None:
-        known = _RIDGE * frame_error(light, frames) / float(frames.mean()) * light.column_power
-    else:
-        raise MitsimError("lambda auto: is chosen under uniform light alone; under patterns give lambda as a number")
+    known = automatic_weight(light, frames, method) if lam == "auto" else check_lambda(lam)
     prior = replace(prior, weight=known) if method == TV else replace(prior, ridge=known)
     energy = float(np.vdot(frames, frames))
     found = minimise(light, frames, prior, iterations, tolerance)
@@ -573,37 +575,52 @@ def reconstruct_psf_request(
     shots: Capture, psf: Path | str | FloatArray, reduce: int, request: ImageRequest, job: Job | None = None
 ) -> Reconstruction:
     request.check_point_spread(reduce)
-    clock = (job or Job()).apart("").clock
-    with clock.stage("read"):
-        light, (left, right), digital, saturated = _light(psf, reduce), shots.patterns, shots.manifest.digital, 0
-        rows, columns = shots.read(shots.manifest.patterns.captures[0].file)[0]["DN"].shape
-        if min(rows, columns) < reduce:
-            raise MitsimError(f"{shots.name}: frames of {rows} x {columns} pixels; reduce by less than {reduce}")
-        uniform = all(side.shape[1] == 1 and bool((side == 1).all()) for side in (left, right))
-        sensor = rows // reduce, columns // reduce
-        camera = ShiftedLight(light, sensor, None if uniform else shots.patterns, np.float32)
-        numbers = camera.grid[0] * camera.grid[1] + camera.count * sensor[0] * sensor[1]
-        Cost(memory_bytes=4.0 * 24 * numbers).check(f"{shots.name}: its image", Limits())
-        frames, variance = np.empty((camera.count, *sensor), np.float32), 0.0
-        for each in shots.pattern_measurements((rows, columns)):
-            frames[each.row * right.shape[1] + each.column] = reduce_frame(each.frame, reduce)
-            saturated += each.saturated
-            variance += float(np.mean(np.maximum(digital.variance(each.light, each.shots), 0.0)))
-    with clock.stage("solve"):
-        solution = solve_point_spread(camera, frames, request.name, request.lam, **request.iterative)
-    with clock.stage("misfit"):
-        known = variance / reduce**2 / camera.count if digital.noise_is_stated else None
-        fit = find_fit(camera, frames, known)
-    status = fit.judge(solution.status)
-    flags = [*each_once({"the capture": shots.warnings})]
-    if saturated:
-        flags.append(f"{saturated} readings are at the full well or the ADC's end: use a shorter exposure.")
-    return Reconstruction(
-        **{**vars(solution), "status": replace(status, flags=(*status.flags, *flags))},
-        fit=fit,
-        seconds={stage: spent for stage, spent in clock.seconds().items() if stage != "total"},
-        inputs=psf_inputs(shots, light, reduce, request),
-    )
+    return SeenFrames(shots, _light(psf, reduce), reduce, job).image(request, request.lam)
+
+
+class SeenFrames:
+    """Frames (K K', m, m') of a run, and the camera that sees them by the ``light`` of a point.
+
+    ``reduce`` x ``reduce`` pixels of the frames become one, as those of the light did.
+    """
+
+    def __init__(self, shots: Capture, light: FloatArray, reduce: int, job: Job | None = None) -> None:
+        self.shots, self.light, self.reduce = shots, light, reduce
+        self._clock, self._saturated, variance = (job or Job()).apart("").clock, 0, 0.0
+        with self._clock.stage("read"):
+            (left, right), digital = shots.patterns, shots.manifest.digital
+            rows, columns = shots.read(shots.manifest.patterns.captures[0].file)[0]["DN"].shape
+            if min(rows, columns) < reduce:
+                raise MitsimError(f"{shots.name}: frames of {rows} x {columns} pixels; reduce by less than {reduce}")
+            uniform = all(side.shape[1] == 1 and bool((side == 1).all()) for side in (left, right))
+            sensor = rows // reduce, columns // reduce
+            camera = ShiftedLight(light, sensor, None if uniform else shots.patterns, np.float32)
+            numbers = camera.grid[0] * camera.grid[1] + camera.count * sensor[0] * sensor[1]
+            Cost(memory_bytes=4.0 * 24 * numbers).check(f"{shots.name}: its image", Limits())
+            frames = np.empty((camera.count, *sensor), np.float32)
+            for each in shots.pattern_measurements((rows, columns)):
+                frames[each.row * right.shape[1] + each.column] = reduce_frame(each.frame, reduce)
+                self._saturated += each.saturated
+                variance += float(np.mean(np.maximum(digital.variance(each.light, each.shots), 0.0)))
+        self._variance = variance / reduce**2 / camera.count if digital.noise_is_stated else None
+        self.camera, self.frames = camera, frames
+
+    def image(self, request: ImageRequest, lam: float | Literal["auto"]) -> Reconstruction:
+        """Return the image with ``lam``, which may be that of several lines."""
+        with self._clock.stage("solve"):
+            solution = solve_point_spread(self.camera, self.frames, request.name, lam, **request.iterative)
+        with self._clock.stage("misfit"):
+            fit = find_fit(self.camera, self.frames, self._variance)
+        status = fit.judge(solution.status)
+        flags = [*each_once({"the capture": self.shots.warnings})]
+        if self._saturated:
+            flags.append(f"{self._saturated} readings are at the full well or the ADC's end: use a shorter exposure.")
+        return Reconstruction(
+            **{**vars(solution), "status": replace(status, flags=(*status.flags, *flags))},
+            fit=fit,
+            seconds={stage: spent for stage, spent in self._clock.seconds().items() if stage != "total"},
+            inputs=psf_inputs(self.shots, self.light, self.reduce, request),
+        )
 
 
 def psf_inputs(shots: Capture, psf: FloatArray, reduce: int, request: ImageRequest) -> dict[str, Any]:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -373,6 +373,10 @@ def _of_colours(lines: SpectralFolder) -> Shown:
             for number, name in enumerate(names)
         },
     )
+    by_spread = reconstruct.POINT_SPREAD in (data.get("inputs") or {})
+    if by_spread:
+        model = ColourModel(colours.wavelengths_nm, np.array(data["matrix"]), str(data["matrix_fitted_on"]))
+        image = replace(image, by_point=model, solution=data)
     data |= {"shape": images.shape[:2], "channels": colours.channels}
     reasons = data.get("warnings") or ()
     swatches = []
@@ -385,7 +389,8 @@ def _of_colours(lines: SpectralFolder) -> Shown:
     ideal, pictures = "image that a perfect camera would recover of the same lines, by the same matrix", list[Picture]()
     for name, xyz, about in (("image", image.xyz, size), ("truth", image.truth_xyz, ideal)):
         if xyz is not None:
-            caption = f"{about}; white is a perfect reflector; colours beyond the screen's are clipped"
+            white = "the brightest pixel" if by_spread else "a perfect reflector"
+            caption = f"{about}; white is {white}; colours beyond the screen's are clipped"
             pictures.append(Picture(name, f"The {name}", caption, png(linear_srgb(xyz), LARGEST, SMALLEST)))
     if image.delta_e is not None:
         ends = 0.0, max(float(np.percentile(image.delta_e, 99)), 1.0)
@@ -393,7 +398,9 @@ def _of_colours(lines: SpectralFolder) -> Shown:
         pictures.append(Picture.of("error", title, image.delta_e, about, unit, ends, quantity="error"))
     for number, line in enumerate(colours.channels):
         title, own, quality_of_line = f"{line.wavelength_nm:g} nm", images[..., number], image.qualities[line.name]
-        pictures.append(Picture.of(f"image_{line.name}", f"{title}, image", own, str(quality_of_line or "")))
+        scale: dict[str, Any] = {"unit": "electrons/s", "ends": (0.0, None)} if by_spread else {}
+        about = str(quality_of_line or "")
+        pictures.append(Picture.of(f"image_{line.name}", f"{title}, image", own, about, **scale))
         if truth is not None:
             pictures.append(Picture.of(f"truth_{line.name}", f"{title}, truth", truth[..., number]))
             pictures.append(_difference(f"error_{line.name}", f"{title}, difference", own, truth[..., number]))
@@ -422,7 +429,8 @@ class ColourImage:
 
     ``images`` and ``truth`` (n, n', lines) are reflectances relative to the calibration's ``board``. Colours are fitted
     on a ``chart``; MitsimError if it lies outside. ``solution`` and ``of_lines`` are numbers of one solve for all
-    lines, or of each line's, by the keys of the JSON. An image of other ``inputs`` is not replaced.
+    lines, or of each line's, by the keys of the JSON. An image of other ``inputs`` is not replaced. By a point spread
+    function the images are in electrons/s, of which ``by_point`` makes colours.
     """
 
     lines: ColourManifest
@@ -437,7 +445,8 @@ class ColourImage:
     output: str = ""
     solution: Mapping[str, Any] = field(default_factory=dict)
     of_lines: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    inputs: Mapping[str, str | float] = field(default_factory=dict)
+    inputs: Mapping[str, Any] = field(default_factory=dict)
+    by_point: ColourModel | None = None
 
     def __post_init__(self) -> None:
         self.model  # noqa: B018 - refuses a chart outside the image
@@ -445,6 +454,8 @@ class ColourImage:
     @cached_property
     def model(self) -> ColourModel:
         waves = self.lines.wavelengths_nm
+        if self.by_point:
+            return self.by_point
         if self.chart is None:
             return ColourModel.of_lines(waves)
         return ColourModel.fit(waves, self.board * self.chart.means(self.images), "the chart in this image")
@@ -504,6 +515,9 @@ class ColourImage:
     @property
     def sentences(self) -> list[str]:
         sentences = [f"Colours follow from a matrix fitted on {self.model.fitted_on}"]
+        if self.by_point:
+            white = f"image.png shows {self.solution['white']:.3g} electrons/s"
+            sentences = [f"{white} of the mean line as white, with {self.model.fitted_on}"]
         if self.delta_e is not None:
             sentences.append(f"The mean Delta E 2000 of all pixels to the truth is {self.delta_e.mean():.2f}")
         if self.patches:

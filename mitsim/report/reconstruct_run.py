@@ -25,17 +25,19 @@ from mitsim.core.job import Job
 from mitsim.core.manifests import CalibrationManifest, read_manifest
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.runs import load_mosaic, load_run
-from mitsim.devices.camera import load_psf
+from mitsim.devices.camera import load_psf, load_psf_channels
 from mitsim.devices.framelist import ChartPlace
 from mitsim.metrics import Quality, summary_of, truth_error_for, truth_for
 from mitsim.optics.terms import best_term
-from mitsim.reconstruct.colour import PLANES, JointMosaic
+from mitsim.reconstruct.colour import PLANES, ColourModel, JointMosaic
 from mitsim.reconstruct.factors import load_calibration
 from mitsim.reconstruct.misfit import UNEXPLAINED
 from mitsim.reconstruct.reconstruct import MADE_OF, Reconstruction, check_same_inputs, may_replace, reconstruct_request
 from mitsim.reconstruct.request import IMAGE_FILE, PICTURE_FILE, ImageRequest, check_joint
 from mitsim.reconstruct.solver import Solution, automatic_lambda, prepare
 from mitsim.report.folder_page import ColourImage, report_folder, state_image
+
+_LEAST = 1e-300
 
 # -------- The image of one line
 
@@ -121,6 +123,7 @@ def reconstruct_colours(
     overwrite: bool = False,
     job: Job | None = None,
     page: bool = True,
+    reduce: int = 1,
     **options: Any,
 ) -> ColourImage:
     """Recover the image of every line of a coloured run, and combine them to one image in colour.
@@ -130,7 +133,8 @@ def reconstruct_colours(
     Parameters
     ----------
     run, calibration
-        Coloured folders of the same lines.
+        Coloured folders of the same lines. In place of a calibration a picture of a point spread function may be given,
+        with a channel for each line or one for all.
     output
         A folder: new or empty, or with an earlier coloured image of the same inputs.
     chart
@@ -142,8 +146,11 @@ def reconstruct_colours(
         Clock of the work.
     page
         False to leave out pictures and report.html, which :func:`mitsim.report` makes later.
+    reduce
+        Pixels a side that become one, by a point spread function.
     **options
-        Options of :func:`mitsim.reconstruct`, for every line; of a run behind colour filters, ``lam`` alone.
+        Options of :func:`mitsim.reconstruct`, for every line; of a run behind colour filters, ``lam`` alone; by a point
+        spread function those of :func:`mitsim.reconstruct_psf`.
 
     Raises
     ------
@@ -153,6 +160,15 @@ def reconstruct_colours(
     run, calibration, output, job = Path(run), Path(calibration), Path(output), job or Job()
     found = colour_files.open_lines(run, colour_files.RUN, colour_files.MOSAIC)
     lines = found.filters or colour_files.read_colours(run, colour_files.RUN)
+    if calibration.is_file():
+        if found.filters or chart:
+            raise MitsimError(
+                f"{calibration}: is no calibration folder, which runs behind colour filters and charts need"
+            )
+        image = _solve_by_point(lines, run, calibration, output, reduce, overwrite, job, ImageRequest(**options))
+        if page:
+            report_folder(output)
+        return image
     colour_files.check_lines(lines, str(run), calibration)
     boards = {read_manifest(calibration / name, CalibrationManifest).board_reflectance for name in lines.names}
     if len(boards) > 1:
@@ -211,6 +227,71 @@ def reconstruct_colours(
             )
     if page:
         report_folder(output)
+    return image
+
+
+@single_threaded_blas()
+def _solve_by_point(
+    lines: colour_files.ColourManifest,
+    run: Path,
+    psf: Path,
+    output: Path,
+    reduce: int,
+    overwrite: bool,
+    job: Job,
+    request: ImageRequest,
+) -> ColourImage:
+    """Solve each line with its own channel of the light, and one lambda: channels of other sharpness have fringes."""
+    from mitsim.reconstruct.point_spread import SeenFrames, automatic_weight, psf_inputs
+
+    request.check_point_spread(reduce)
+    shots = {name: load_run(run / name) for name in lines.names}
+    first = shots[lines.names[0]]
+    (rows, columns), how = first.summary()["shape"], first.manifest.configuration.get("prepare")
+    light = load_psf_channels(psf, lines.names, (rows, columns), how if isinstance(how, dict) else {}, reduce)
+    totals = light.sum(axis=(1, 2))
+    inputs = psf_inputs(first, light, reduce, request)
+    inputs["run"] = "-".join(each.fingerprint for each in shots.values())
+    replaces = colour_files.is_coloured(output)
+    if replaces and not overwrite:
+        colour_files.read_colours(output, colour_files.IMAGE)
+        check_same_inputs(output, read_json(output / colour_files.COLOUR), inputs)
+    with output_folder(output, overwrite=replaces) as folder:
+        channels = (light / totals[:, None, None]).repeat(len(lines.names) // len(light), axis=0)
+        seen = {
+            name: SeenFrames(each, channel, reduce, job.apart(f"{name} "))
+            for (name, each), channel in zip(shots.items(), channels, strict=True)
+        }
+        lam = request.lam
+        if lam == "auto":
+            weights = [automatic_weight(each.camera, each.frames, request.name) for each in seen.values()]
+            lam = float(np.exp(np.mean(np.log(np.maximum(weights, _LEAST)))))
+        state_image(folder, lines, status="incomplete", inputs=inputs)
+        solved, of_lines = dict[str, Reconstruction](), dict[str, dict[str, Any]]()
+        for name, each in seen.items():
+            solved[name] = each.image(request, lam)
+            with output_folder(folder / name, overwrite=True) as place:
+                of_lines[name] = Judged(solved[name], None, str(place)).summary()
+                solved[name].write(place, {**of_lines[name], **_origin(job, run / name)})
+        images = np.stack([each.image for each in solved.values()], axis=-1)
+        # A white object has the colours of the point.
+        balance = np.broadcast_to(totals / totals.mean(), len(solved))
+        white = max(float((images / balance).max()), _LEAST)
+        image = ColourImage(
+            lines=lines,
+            images=images,
+            board=1.0,
+            qualities=dict.fromkeys(lines.names),
+            facts={"solved": "each line by its light of a point, all with one lambda", "lambda": f"{lam:.3g}"},
+            warnings=each_once({name: each.status.reasons for name, each in solved.items()}),
+            seconds={"total": sum(each["seconds"]["total"] for each in of_lines.values())},
+            output=str(folder),
+            solution={"lambda": lam, "white": white, "balance": balance},
+            of_lines=of_lines,
+            inputs=inputs,
+            by_point=ColourModel.of_channels(lines.names, lines.wavelengths_nm, white * balance),
+        )
+        image.write(folder, **_origin(job, run))
     return image
 
 

@@ -163,11 +163,37 @@ def test_a_picture_too_large_for_any_sensor_is_refused_by_its_header(tmp_path: P
         list(read_images(tmp_path / "a.tif", Wanted(most=6)))
 
 
-@pytest.mark.parametrize("name", ["a.png", "a.tif"])
-def test_colours_are_read_where_they_are_wanted(tmp_path: Path, name: str) -> None:
-    colours = np.random.default_rng(2).integers(0, 256, (5, 7, 3), np.uint8)
-    saved(colours)(tmp_path / name)
+def deep_colours(path: Path, colours: np.ndarray) -> None:
+    """A PNG of 16 bits, of which Pillow writes none."""
+    rows, columns, _ = colours.shape
+    lines = b"".join(b"\0" + row.astype(">u2").tobytes() for row in colours)
+    parts = b"IHDR" + struct.pack(">IIBBBBB", columns, rows, 16, 2, 0, 0, 0), b"IDAT" + zlib.compress(lines), b"IEND"
+    chunks = (struct.pack(">I", len(part) - 4) + part + struct.pack(">I", zlib.crc32(part)) for part in parts)
+    path.write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(chunks))
+
+
+@pytest.mark.parametrize(("name", "bits"), [("a.png", 8), ("a.tif", 8), ("a.png", 16), ("a.tif", 16), ("a.npy", 16)])
+def test_colours_are_read_where_they_are_wanted(tmp_path: Path, name: str, bits: int) -> None:
+    """(Planted: the low byte of 16 bits left out, or read as the high one.)"""
+    colours = np.random.default_rng(2).integers(0, 2**bits, (5, 7, 3), f"u{bits // 8}")
+    if bits == 8:
+        saved(colours)(tmp_path / name)
+    elif name == "a.tif":
+        tifffile.imwrite(tmp_path / name, colours, photometric="rgb")
+    else:
+        {"a.png": deep_colours, "a.npy": np.save}[name](tmp_path / name, colours)
     assert np.array_equal(read_image(tmp_path / name, Wanted(colour=True)), colours)
+    if name == "a.png":
+        good = (tmp_path / name).read_bytes()
+        for bad in (good[:60], good.replace(b"IDAT", b"IDAX"), good[:24] + b"\x05" + good[25:]):
+            (tmp_path / name).write_bytes(bad)
+            with pytest.raises(MitsimError, match=r"cannot be read|is no grey PNG"):
+                read_image(tmp_path / name, Wanted(colour=True))
+    if name == "a.tif":
+        tifffile.imwrite(tmp_path / name, np.moveaxis(colours, 2, 0), photometric="rgb", planarconfig="separate")
+        with pytest.raises(MitsimError, match="pixel by pixel"):
+            read_image(tmp_path / name, Wanted(colour=True))
+    name = name.replace("npy", "png")
     Image.new("P", (7, 5)).save(tmp_path / name)
     with pytest.raises(MitsimError, match="nor of red, green and blue"):
         read_image(tmp_path / name, Wanted(colour=True))

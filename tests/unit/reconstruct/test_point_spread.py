@@ -23,6 +23,7 @@ from mitsim.core.images import lightness, read_image
 from mitsim.core.manifests import Digital, Patterns, RunHead, RunManifest
 from mitsim.core.runs import Capture, Recorder, frame_name
 from mitsim.devices.patterns import parse_patterns
+from mitsim.exchange.formats import import_frames
 from mitsim.reconstruct import point_spread as ps
 from mitsim.reconstruct.solver import Verdict
 from mitsim.reconstruct.solvers import Prior
@@ -470,3 +471,103 @@ def test_the_command_line_writes_an_image_and_ends_with_1_where_it_is_not_conver
     refused += [(*psf, "--bounds", "x", "--method", "tv"), (*psf, "--chart", "x")]
     for words in refused:
         assert call(*words, "-o", str(tmp_path / "no"))[0] == 2 and not (tmp_path / "no").exists(), words
+
+
+# ---- Images in colour ------------------------------------------------------------------------------------------------
+
+CAMERA = """
+name = "bench"
+pixel_pitch_um = 5.0
+full_well_e = 60000.0
+read_noise_e = 2.0
+gain_dn_per_e = 1.0
+black_level_dn = 10.0
+bits = 16
+source = "made up"
+"""
+TINTS = np.array([0.5, 1.0, 0.25])
+"""Parts of the point's light that the filters let through."""
+
+
+def colour_pair(folder: Path) -> tuple[dict[str, Any], np.ndarray, np.ndarray, np.ndarray]:
+    """Facts, a frame and the light of a point in red, green and blue, and the colours of the scene."""
+    (folder / "camera.toml").write_text(CAMERA)
+    facts = {"camera": folder / "camera.toml", "exposure": 1.0, "patterns": "uniform", "projector_pixels": 8}
+    light, rng = light_of_a_point(), np.random.default_rng(3)
+    lights = np.stack([light, light[:, ::-1], light[::-1]], axis=-1) * TINTS  # colours go different ways
+    camera = ps.ShiftedLight(light, (60, 62))
+    scene = np.zeros((*camera.scene, 3))
+    for number, colour in enumerate(([1, 0.5, 0.2], [0.2, 1, 0.5], [0.5, 0.5, 1])):
+        scene[24:74, 30 + 16 * number : 42 + 16 * number] = colour
+    frame = [ps.ShiftedLight(lights[..., c], (60, 62)).image_of(4000.0 * scene[..., c])[0] for c in range(3)]
+    seen = rng.poisson(np.maximum(np.stack(frame, axis=-1), 0)) + 10
+    return facts, seen.astype(np.uint16), lights / lights.max() * 40000 + 10, scene[camera.window]
+
+
+def called(*words: object) -> tuple[int, Any]:
+    done = CliRunner().invoke(app, [*map(str, words), "--json", "--no-pictures"], standalone_mode=False)
+    if done.exception:
+        assert isinstance(done.exception, MitsimError) and "\n" not in str(done.exception), done.exception
+        return 2, str(done.exception)
+    return done.return_value, json.loads(done.stdout)
+
+
+def test_an_image_in_colour_has_the_scene_s_colours_in_the_point_s_light(tmp_path: Path) -> None:
+    """(Planted: one channel's light for all; the tints left in; a lambda for each line; planes exchanged.)"""
+    facts, seen, light, scene = colour_pair(tmp_path)
+    np.save(tmp_path / "seen.npy", seen)
+    np.save(tmp_path / "psf.npy", light)
+    import_frames(tmp_path / "seen.npy", tmp_path / "run", **facts)
+    asked = "reconstruct", tmp_path / "run", "--method", "tv", "-o"
+
+    def error(name: str) -> float:
+        parts = read_frame(tmp_path / name / "image.exr")[0]
+        image = np.stack([parts[each] for each in "RGB"], axis=-1)
+        return float(np.abs(image * (scene.mean() / image.mean()) - scene).mean() / scene.mean())
+
+    status, found = called(*asked, tmp_path / "image", "--psf", tmp_path / "psf.npy")
+    assert status == 0, found
+    assert found["balance"] == pytest.approx(TINTS / TINTS.mean(), rel=0.01)
+    assert {channel["lambda"] for channel in found["channels"]} == {found["lambda"]}
+    assert error("image") < 0.25
+    grey, _ = called(*asked, tmp_path / "grey", "--psf", save(tmp_path / "grey.npy", light[..., 1]))
+    assert grey == 1 and error("grey") > 0.5, "its red and blue are turned"
+    page = ms.report(tmp_path / "image").read_text(encoding="utf-8")
+    assert "white is the brightest pixel" in page and "electrons/s" in page
+    wide = np.full((60, 62, 3), 10.0)
+    wide[10:50, 9:53] = light
+    raw, shot = mosaic(wide), save(tmp_path / "shot.npy", mosaic(seen))
+    planes = import_frames(shot, tmp_path / "planes", channel="all", mosaic="RGGB", **facts)
+    assert planes["planes"] == ["r", "gb", "gr", "b"]
+    asked = "reconstruct", tmp_path / "planes", "--method", "tv", "-o"
+    status, found = called(*asked, tmp_path / "mosaic", "--psf", save(tmp_path / "raw.npy", raw))
+    assert status == 0 and error("mosaic") < 0.25, found
+    for psf, words in (
+        (save(tmp_path / "four.npy", np.dstack([light, light[..., 1]])), "has 4 channels, and the run has 3 lines"),
+        (save(tmp_path / "dark.npy", light * [1, 1, 0]), "nothing is brighter than its edges"),
+        (save(tmp_path / "nan.npy", np.where(light == light.max(), np.nan, light)), "1 values are not finite"),
+        (save(tmp_path / "tiny.npy", light[:9]), "needs more than 32 pixels"),
+        (tmp_path / "run", "is no file"),
+    ):
+        status, text = called("reconstruct", tmp_path / "run", "--psf", psf, "-o", tmp_path / "no")
+        assert status == 2 and words in text and not (tmp_path / "no").exists(), text
+    status, text = called(*asked, tmp_path / "no", "--psf", save(tmp_path / "odd.npy", raw[1:]))
+    assert status == 2 and "a raw mosaic of the run's 60 x 62 pixels a plane has twice as many" in text
+    for more in ({"channel": "all"}, {"channel": "r", "mosaic": "RGGB"}):
+        with pytest.raises(ArgumentError, match="is no mosaic but in colour"):
+            import_frames(tmp_path / "seen.npy", tmp_path / "no", **facts, **more)
+    np.save(tmp_path / "seen.npy", np.dstack([seen, seen[..., 0]]))
+    with pytest.raises(MitsimError, match="has 4 numbers a pixel"):
+        import_frames(tmp_path / "seen.npy", tmp_path / "no", **facts)
+
+
+def mosaic(colours: np.ndarray) -> np.ndarray:
+    """Numbers behind filters RGGB, of which each sees its own colour of a pixel."""
+    raw = np.kron(colours[..., 1], np.array([[0, 1], [1, 0]], colours.dtype))
+    raw[::2, ::2], raw[1::2, 1::2] = colours[..., 0], colours[..., 2]
+    return raw
+
+
+def save(path: Path, values: np.ndarray) -> Path:
+    np.save(path, values)
+    return path
