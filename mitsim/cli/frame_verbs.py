@@ -34,7 +34,7 @@ from mitsim.devices.framelist import load_chart
 from mitsim.devices.patterns import pattern_names
 from mitsim.devices.sensor import load_sensor
 from mitsim.exchange.capture_list import FrameFacts
-from mitsim.exchange.formats import READERS, Exported, Pictures
+from mitsim.exchange.formats import OF_FOLDERS, READERS, Exported, Pictures
 from mitsim.learn.requests import METHODS, Schedule, Training
 from mitsim.reconstruct.request import MODEL, ImageRequest, check_joint, check_parallax, holds_image
 from mitsim.verbs import CompareOptions, load_network
@@ -322,21 +322,25 @@ def sense(asked: Sensing) -> int:
 class Exporting(Exported, Common):
     """Options of `mitsim export`."""
 
-    run: Path = argument(..., "run folder, of `mitsim capture` or `mitsim import`", "RUN")
+    run: Path = argument(
+        ..., "run folder, of `mitsim capture` or `mitsim import`; for a dataset, of `mitsim pairs`", "RUN"
+    )
 
 
 @command
 def export(asked: Exporting) -> int:
-    """Convert a run to a file that other programs read.
+    """Convert a run, or pairs, to files that other programs read.
 
     $ mitsim export run --format hdf5 -o run.h5
     $ mitsim export run --format mat -o run.mat --calibration cal
+    $ mitsim export pairs --format dataset -o dataset --calibration cal
     """
-    if asked.format == "png":
-        asked.refuse(["overwrite"], "with png, which never replaces a folder")
+    if asked.format in OF_FOLDERS:
+        asked.refuse(["overwrite"], f"with {asked.format}, which never replaces a folder")
     payload = mitsim.export(asked.run, **asked.given_of(Exported))
     with_it = f" with {payload['calibration']}" if payload["calibration"] else ""
-    lines = [f"{payload['frames']} frames{with_it} as {asked.format}: {payload['output']}", *payload["notes"]]
+    number = f"{payload['frames']} frames" if payload["pairs"] is None else f"{payload['pairs']} pairs"
+    lines = [f"{number}{with_it} as {asked.format}: {payload['output']}", *payload["notes"]]
     return asked.finish(payload, lines)
 
 

@@ -30,9 +30,9 @@ PIXEL_FORMATS: dict[PixelFormat, tuple[int, int]] = {
 _Side = Annotated[int, Field(ge=1, le=MOST_SIDE)]
 _Place = Annotated[int, Field(ge=0, lt=MOST_SIDE)]
 PLANES = ("r", "gb", "gr", "b")
+"""FlatCam's names: gb is the green plane in the rows of blue pixels."""
 RGB = ("r", "g", "b")
 """Channels of a picture in colour."""
-"""FlatCam's names: gb is the green plane in the rows of blue pixels."""
 ALL = "all"
 WAVELENGTHS_NM = 600.0, 540.0, 460.0
 """Default wavelengths of red, green and blue planes [nm], as in calibration/ov5647.toml."""
@@ -63,11 +63,11 @@ class Raw(Configuration):
     shape: tuple[_Side, _Side] = Field(strict=False)
     """Rows and columns."""
     bits: int | None = Field(default=None, ge=1, le=32)
-    """Bits of a number; up to 8 take a byte, up to 16 two, up to 32 four; none: as `pixel_format` states."""
+    """Bits of a number; up to 8 take a byte, up to 16 two, up to 32 four; none: as in `pixel_format`."""
     byte_order: Literal["little", "big"] = "little"
     """Order of the bytes of a number."""
     pixel_format: PixelFormat | None = None
-    """Packed format of the numbers, by its name in GenICam, in place of `bits` and `byte_order`; none: whole bytes."""
+    """Packed format of GenICam, in place of `bits` and `byte_order`; none: numbers take whole bytes."""
 
     @model_validator(mode="after")
     def _has_one_layout(self) -> Raw:

@@ -27,13 +27,17 @@ if TYPE_CHECKING:
 
 # ---- Export ----
 
-HDF5, PNG = "hdf5", "png"
-"""Only HDF5 holds several spectral lines; only pictures are a folder, and hold no calibration."""
+HDF5, PNG, DATASET = "hdf5", "png", "dataset"
+"""Only HDF5 holds several spectral lines; only pictures hold no calibration; a data set is made of pairs, not of a run.
+"""
+OF_FOLDERS = PNG, DATASET
+"""Formats that are a folder, which is never replaced."""
 FORMATS = {
     HDF5: "packed.write_hdf5",
     "mat": "other_programs.write_matlab",
     "torch": "other_programs.write_torch",
     PNG: "other_programs.write_pngs",
+    DATASET: "dataset.write_dataset",
 }
 """Functions that write each format: from place, run, and calibration or projector to notes on the use of the file, or
 on parts of the run that it does not hold."""
@@ -54,10 +58,16 @@ class Exported(Options):
     PANEL = configuration.OUTPUT
     VERB = "export"
 
-    format: str = option(..., "hdf5, mat, torch or png", metavar="FORMAT")
-    output: FilePath = option(..., "file to make; with png, a folder", "-o", "--output", metavar="FILE", kind=Path)
+    format: str = option(..., "hdf5, mat, torch, png or dataset", metavar="FORMAT")
+    output: FilePath = option(
+        ..., "file to make; with png or dataset, a folder", "-o", "--output", metavar="FILE", kind=Path
+    )
     calibration: FilePath | None = option(
-        None, "calibration folder to include in the file", metavar="CAL", panel=configuration.WHAT, kind=Path
+        None,
+        "calibration folder to include in the file; for a dataset, to make its images by",
+        metavar="CAL",
+        panel=configuration.WHAT,
+        kind=Path,
     )
     overwrite: bool = option(False, "replace an existing file")
     projector: str | None = option(
@@ -69,23 +79,23 @@ class Exported(Options):
 def export(
     run: Path | str, format: str, output: Path | str, calibration: Path | str | None = None, **options: Any
 ) -> dict[str, Any]:
-    """Write a run in a format that other programs read.
+    """Write a run, or pairs as a data set, in a format that other programs read.
 
     Parameters
     ----------
     run
-        RUN folder, also a coloured one, or one behind colour filters.
+        RUN folder, also a coloured one, or one behind colour filters; for a data set, folder of `mitsim pairs`.
     format
         Key of :data:`FORMATS`.
     output
         File or folder to create.
     calibration
-        CAL folder to include.
+        CAL folder to include; None takes the one in the pairs' folder for a data set.
 
     Returns
     -------
     dict
-        `format`, `output`, `frames` (of all lines), `calibration`, `notes`: the output of the command line.
+        `format`, `output`, `frames` (of all lines), `pairs`, `calibration`, `notes`: the output of the command line.
 
     Raises
     ------
@@ -96,6 +106,9 @@ def export(
     """
     asked = Exported(format=format, output=output, calibration=calibration, **options)
     check_export(run, asked)
+    if format == DATASET:
+        made: dict[str, Any] = _function(FORMATS[format])(Path(run), asked)
+        return made
     with nullcontext() if format == PNG else output_file(Path(output), asked.overwrite):
         from mitsim.exchange.packed import read_content
 
@@ -105,6 +118,7 @@ def export(
     return {
         "format": format,
         "frames": _frames_of(shots),
+        "pairs": None,
         "calibration": None if calibration is None else str(calibration),
         "notes": list(notes),
         "output": str(Path(output)),
@@ -114,6 +128,10 @@ def export(
 def check_export(run: Path | str, asked: Exported) -> None:
     """Raise the errors that :func:`export` raises before it writes."""
     check_format(asked)
+    if asked.format == DATASET:
+        _, place, _ = _function("dataset.open_pairs")(Path(run), asked.calibration)
+        check_apart(Path(asked.output), [Path(run), place])
+        return
     lines, kind = colour_files.open_lines(Path(run), colour_files.RUN, colour_files.MOSAIC), asked.format
     calibrated = None if asked.calibration is None else lines.check_calibration(Path(asked.calibration))
     if lines.colours and kind != HDF5:

@@ -46,7 +46,7 @@ from mitsim.core.job import Cost, Job
 from mitsim.core.manifests import SIDES
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.seeds import integer, stream
-from mitsim.learn.pair_store import ModelManifest, PairStore
+from mitsim.learn.pair_store import ModelManifest, PairStore, check_sizes, part_photographs
 from mitsim.learn.requests import FEWEST_PAIRS, FEWEST_PHOTOGRAPHS, FLATNET, REFINED, UNROLLED, Training
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.misfit import UNEXPLAINED
@@ -438,8 +438,6 @@ def relative_noise(problem: DiagonalProblem) -> float:
 
 # ---- Pairs, and their parts ----
 
-_PART, _MOST = 16, 48
-"""One photograph in 16 chooses the best step, and one judges, up to 48 pairs each."""
 _LOOKS = 20
 _PATIENCE = 6
 _GAIN_DB = 0.01
@@ -492,18 +490,6 @@ class Sums:
             job.progress("read", (index + 1) / count)
         limits = float(noise.min()), float(noise.max())
         return cls(np.stack(truths), np.stack(weights), variances, limits, store.photographs)
-
-
-def part_photographs(photographs: Labels, seed: int) -> tuple[Labels, Labels, Labels]:
-    """Return the numbers of the pairs that teach, that choose the best step, and that judge.
-
-    All pairs of a photograph belong to one part, because a network that has learned one crop knows much of the next.
-    """
-    names = stream(seed, "judging").permutation(np.unique(photographs))
-    count = min(max(len(names) // _PART, 1), _MOST)
-    parts = names[2 * count :], names[:count], names[count : 2 * count]
-    teaching, choosing, judging = (np.flatnonzero(np.isin(photographs, part)) for part in parts)
-    return teaching, choosing[:_MOST], judging[:_MOST]
 
 
 # ---- Steps ----
@@ -659,13 +645,7 @@ def train_network(
             f"{store.folder}: its pairs show {count} photographs; give at least {FEWEST_PHOTOGRAPHS}, because one "
             "chooses the best step and one judges, and neither may teach"
         )
-    frame, shape = (len(factors.left), len(factors.right)), (factors.left.shape[1], factors.right.shape[1])
-    found = tuple(store.manifest.m), tuple(len(side) for side in store.patterns)
-    if (frame, shape) != found:
-        raise MitsimError(
-            f"calibration {factors.name}: has frames of {frame} and images of {shape} pixels, but {store.folder} "
-            f"{found[0]} and {found[1]}; calibrate this camera"
-        )
+    shape = check_sizes(store, factors)
     with job.clock.stage("read"):
         prepared = SOLVERS[TIKHONOV].init(factors, store.patterns)
         network = first_network(request, shape)

@@ -34,6 +34,7 @@ from mitsim.devices.patterns import Lighting, PatternFamily, parse_patterns
 from mitsim.devices.sensor import SensorModel, digital_of
 from mitsim.optics.frames import AccumulatedLight, ExpectedFrames, add_speckle
 from mitsim.optics.image_formation import FrameOptics
+from mitsim.reconstruct.factors import Factors
 from mitsim.sensor.chain import expose
 
 if TYPE_CHECKING:
@@ -43,6 +44,8 @@ FORMAT = 1
 WHITE = 255
 _LIGHTS_KEPT = 32
 """Lights of shards in memory, some 10 MB each."""
+_PART, _MOST = 16, 48
+"""One photograph in 16 chooses the best step, and one judges, up to 48 pairs each."""
 Frames = npt.NDArray[np.float32]
 
 
@@ -413,6 +416,30 @@ class PairStore:
         path = self.folder / shard.file
         with hdf5_errors(path), _open_shard(path, self._known) as file:
             yield file
+
+
+def check_sizes(store: PairStore, factors: Factors) -> tuple[int, int]:
+    """Return the shape of images; MitsimError if a calibration has frames or images of other sizes than the pairs."""
+    frame, shape = (len(factors.left), len(factors.right)), (factors.left.shape[1], factors.right.shape[1])
+    found = tuple(store.manifest.m), tuple(len(side) for side in store.patterns)
+    if (frame, shape) != found:
+        raise MitsimError(
+            f"calibration {factors.name}: has frames of {frame} and images of {shape} pixels, but {store.folder} "
+            f"{found[0]} and {found[1]}; calibrate this camera"
+        )
+    return shape
+
+
+def part_photographs(photographs: Labels, seed: int, most: int | None = _MOST) -> tuple[Labels, Labels, Labels]:
+    """Return the numbers of the pairs that teach, that choose the best step, and that judge, ``most`` of each of these.
+
+    All pairs of a photograph belong to one part, because a network that has learned one crop knows much of the next.
+    """
+    names = stream(seed, "judging").permutation(np.unique(photographs))
+    count = min(max(len(names) // _PART, 1), _MOST)
+    parts = names[2 * count :], names[:count], names[count : 2 * count]
+    teaching, choosing, judging = (np.flatnonzero(np.isin(photographs, part)) for part in parts)
+    return teaching, choosing[:most], judging[:most]
 
 
 def read_pairs_manifest(folder: Path) -> PairsManifest:

@@ -30,7 +30,7 @@ from mitsim.core.manifests import CalibrationManifest, RunManifest, read_manifes
 from mitsim.design.goal import Goal
 from mitsim.devices.framelist import load_chart
 from mitsim.devices.session import SessionRecipe, load_recipe
-from mitsim.exchange.formats import PNG, Exported, check_export, export
+from mitsim.exchange.formats import OF_FOLDERS, Exported, check_export, export
 from mitsim.reconstruct.request import MODEL, ImageRequest
 from mitsim.sessions import session_file
 from mitsim.verbs import RunOptions, StudyOptions, calibrate_in, capture_in, load_network, open_as, prepare_study
@@ -412,7 +412,7 @@ class _Steps:
             how["calibration"] = self._source(step, "calibration")
         if "run" in values and ("calibration" in values or "calibration" not in how):
             check_export(run, Exported(**how))
-        pictures = values["format"] == PNG  # a folder of which is not replaced, so it is refused before any work
+        pictures = values["format"] in OF_FOLDERS  # a folder of which is not replaced, so it is refused before any work
         if not self.is_finished(step) if pictures else step.output not in self.made:
             files.check_output(place, kind="folder" if pictures else "file")
         yield
