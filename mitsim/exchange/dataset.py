@@ -21,7 +21,6 @@ from mitsim.core.images import write_numbers
 from mitsim.core.job import Cost, Limits
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.devices.patterns import short_name
-from mitsim.exchange.formats import Exported
 from mitsim.learn.pair_store import PairStore, check_sizes, part_photographs
 from mitsim.learn.requests import FEWEST_PHOTOGRAPHS
 from mitsim.metrics import psnr
@@ -71,12 +70,12 @@ def open_pairs(pairs: Path, calibration: Path | str | None) -> tuple[PairStore, 
 
 
 @single_threaded_blas()
-def write_dataset(pairs: Path, asked: Exported) -> dict[str, Any]:
-    """Write pairs as a data set with a data card, whole or not at all, and return the output of the command line.
+def write_dataset(pairs: Path, output: Path, calibration: Path | str | None) -> dict[str, Any]:
+    """Write pairs as a data set with a data card, whole or not at all, and return what the export reports.
 
     Splits are those of a training with seed 0. MitsimError as for :func:`open_pairs`, and for too little time or disk.
     """
-    store, place, factors = open_pairs(pairs, asked.calibration)
+    store, place, factors = open_pairs(pairs, calibration)
     made, photographs, count = store.manifest, store.photographs, len(store)
     prepared, flagged = SOLVERS[TIKHONOV].init(factors, store.patterns), Counter[str]()
     model = Model(prepared, factors.sides, store.patterns)
@@ -100,7 +99,7 @@ def write_dataset(pairs: Path, asked: Exported) -> dict[str, Any]:
         files = {"file_name": f"images/{file}", "truth_file_name": f"truths/{file}"}
         return {**files, **dict(zip(_NUMBERS, (index, *numbers), strict=True)), **drawn}
 
-    with whole_folder(asked.output) as folder:
+    with whole_folder(output) as folder:
         started, disk_bytes = time.perf_counter(), count * (8.0 * made.n**2 + _PAIR_BYTES)
         for split, chosen in splits.items():
             rows = list[str]()
@@ -114,16 +113,15 @@ def write_dataset(pairs: Path, asked: Exported) -> dict[str, Any]:
             write_text(folder / split / "metadata.jsonl", "".join(f"{row}\n" for row in rows))
         write_text(folder / "README.md", _card(store, factors))
     sizes = ", ".join(f"{len(chosen)} in {split}" for split, chosen in splits.items())
-    notes = [f"{sizes}; read them by load_dataset('imagefolder', data_dir={str(asked.output)!r})"]
+    notes = [f"{sizes}; read them by load_dataset('imagefolder', data_dir={str(output)!r})"]
     notes += [f"The pairs are flagged: {warning}" for warning in made.warnings]
     notes += [f"{number} of {count} images are flagged: {reason}" for reason, number in flagged.items()]
     return {
-        "format": asked.format,
         "frames": count * made.frames,
         "pairs": count,
         "calibration": str(place),
         "notes": notes,
-        "output": str(asked.output),
+        "output": str(output),
     }
 
 

@@ -107,8 +107,9 @@ def export(
     asked = Exported(format=format, output=output, calibration=calibration, **options)
     check_export(run, asked)
     if format == DATASET:
-        made: dict[str, Any] = _function(FORMATS[format])(Path(run), asked)
-        return made
+        from mitsim.exchange.dataset import write_dataset
+
+        return {"format": format, **write_dataset(Path(run), Path(output), asked.calibration)}
     with nullcontext() if format == PNG else output_file(Path(output), asked.overwrite):
         from mitsim.exchange.packed import read_content
 
@@ -129,7 +130,9 @@ def check_export(run: Path | str, asked: Exported) -> None:
     """Raise the errors that :func:`export` raises before it writes."""
     check_format(asked)
     if asked.format == DATASET:
-        _, place, _ = _function("dataset.open_pairs")(Path(run), asked.calibration)
+        from mitsim.exchange.dataset import open_pairs
+
+        _, place, _ = open_pairs(Path(run), asked.calibration)
         check_apart(Path(asked.output), [Path(run), place])
         return
     lines, kind = colour_files.open_lines(Path(run), colour_files.RUN, colour_files.MOSAIC), asked.format
