@@ -485,7 +485,7 @@ SIZES = {
     "core": (17, 3148),
     "design": (8, 1367),
     "devices": (9, 2246),
-    "exchange": (7, 1634),
+    "exchange": (7, 1633),
     "learn": (5, 1194),
     "light": (6, 1672),
     "optics": (7, 1751),
