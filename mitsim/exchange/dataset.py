@@ -59,7 +59,7 @@ def open_pairs(pairs: Path, calibration: Path | str | None) -> tuple[PairStore, 
     """
     store, place = PairStore.open(pairs), pairs / "calibration" if calibration is None else Path(calibration)
     if calibration is None and not place.is_dir():
-        raise ArgumentError("calibration", f"{pairs} holds none, and images need one; give the folder of its camera")
+        raise ArgumentError("calibration", f"is not given, and {pairs} holds none; give the folder of its camera")
     factors = load_calibration(place)
     ours, theirs = (camera_parts(each.manifest.camera) for each in (store, factors))
     if names := [cut(name) for name in sorted({*ours, *theirs}) if ours.get(name) != theirs.get(name)]:

@@ -15,7 +15,7 @@ from mitsim.core.exr import read_frame
 from tests.exchanged import frame_of
 from tests.system.refusals import Call, Refused, mentions
 
-EXPORTED = {"format", "frames", "calibration", "notes", "output"}
+EXPORTED = {"format", "frames", "pairs", "calibration", "notes", "output"}
 IMPORTED = {"headline", "frames", "output", "calibration_output", "holds", "left_out", "report", "notes", "warnings"}
 
 

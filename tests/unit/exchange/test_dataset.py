@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -105,13 +106,15 @@ def test_what_makes_no_data_set_is_refused_and_leaves_nothing(folder: Path, tmp_
     other = factors.manifest.model_copy(update={"camera": {**factors.manifest.camera, "sensor": sensor}})
     replace(factors, manifest=other).save(tmp_path / "other")
     replace(factors, left=factors.left[:-1]).save(tmp_path / "small")
-    output = tmp_path / "new"
+    output, bare = tmp_path / "new", tmp_path / "bare"
+    shutil.copytree(pairs, bare, ignore=shutil.ignore_patterns("calibration"))
     for source, calibration, place, words in (
         (run.run, None, output, r"holds no pairs\.json; give a folder of `mitsim pairs`"),
         (pairs, tmp_path / "none", output, "none"),
         (pairs, tmp_path / "other", output, r"is of another camera than .*: sensor\.name differs; calibrate"),
         (pairs, tmp_path / "small", output, r"has frames of \(63, 64\)"),
         (pairs, own, pairs, "output"),
+        (bare, None, output, "calibration is not given, and .* holds none; give the folder of its camera"),
         (pairs, own, folder / "data", "exists|holds"),
         (pairs, run.run, output, "calibration"),
     ):
