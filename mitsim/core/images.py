@@ -58,6 +58,11 @@ _UPRIGHT = 1
 _TURNS = {1: (0, False), 2: (0, True), 3: (2, False), 4: (2, True), 5: (-1, True), 6: (-1, False), 7: (1, True)}
 _TURNS[8] = (1, False)
 """Counter-clockwise quarter turns, and whether left and right are swapped afterwards (TIFF 6.0, tag 274)."""
+ORIENTATIONS = {
+    "upright": 1, "mirrored": 2, "upside down": 4, "turned": 3, "transposed": 5,
+    "transposed, mirrored": 6, "transposed, upside down": 8, "transposed, turned": 7,
+}  # fmt: skip
+"""Orientations of TIFF 6.0 and Exif by the words of lists and messages."""
 _MOST_PAGES = 1 << 16
 _PIXEL_BYTES = 24
 """Memory of a pixel while a page is read and checked; measured: at most 21, for a PNG of 16 bits."""
