@@ -477,12 +477,12 @@ def test_samples_are_not_added_up_in_32_bits() -> None:
 # ---- sizes and names -------------------------------------------------------------------------------------------------
 
 SIZES = {
-    "acquire": (5, 1210),
+    "acquire": (5, 1201),
     "api": (2, 188),
     "bench": (5, 1195),
-    "calibrate": (5, 1191),
+    "calibrate": (5, 1154),
     "cli": (6, 1538),
-    "core": (17, 3081),
+    "core": (17, 3085),
     "design": (8, 1367),
     "devices": (9, 2209),
     "exchange": (5, 1299),
@@ -490,7 +490,7 @@ SIZES = {
     "light": (6, 1672),
     "optics": (7, 1751),
     "planner": (6, 1627),
-    "reconstruct": (16, 5547),
+    "reconstruct": (16, 5527),
     "report": (6, 1906),
     "scene": (5, 1353),
     "sensor": (4, 1105),
