@@ -147,14 +147,11 @@ def stripe_sums(
     vertical: npt.ArrayLike,
     count: int,
     centre: bool = False,
-    uniform: npt.ArrayLike | None = None,
     lights: Sequence[FloatArray | None] = (None, None),
 ) -> tuple[StripeSums, StripeSums]:
     first = _response(horizontal, "horizontal response 0", None, centre)
     second = _response(vertical, "vertical response 0", first.shape, centre)
     mean = (upright(first, horizontal) + upright(second, vertical)) / 2
-    if uniform is not None:
-        mean = _response(uniform, "uniform response", first.shape, centre)
     a, v = _rank_one_split(mean)
     left = StripeSums("horizontal", centre, v, np.empty((len(a), count)))
     right = StripeSums("vertical", centre, a, np.empty((len(v), count)))
@@ -169,44 +166,6 @@ def upright(response: FloatArray, light: npt.ArrayLike) -> FloatArray:
 
 
 # ---- From responses, or their sums, to factors ----
-
-
-def estimate_factors(
-    horizontal: Iterable[npt.ArrayLike],
-    vertical: Iterable[npt.ArrayLike],
-    H: npt.ArrayLike,
-    centre: bool = False,
-    uniform: npt.ArrayLike | None = None,
-    noise: float | None = None,
-) -> Estimate:
-    """Estimate the factors of a separable camera from its responses to striped light.
-
-    Responses (m, m') to H[:, i] 1^T and to 1 H[:, i]^T are differences of two captures; ``H`` (n, N) has orthogonal
-    rows of +-1, and a column 0 of +1 unless the response ``uniform`` is given. ``noise`` is a response's rms. Raises
-    MitsimError for a wrong count or shape, values that are not finite, an H that is not orthogonal, or no signal.
-    """
-    signs = np.asarray(H, dtype=np.float64)
-    if signs.ndim != 2 or signs.size == 0 or not (np.abs(signs) == 1).all():
-        raise MitsimError(f"H of shape {signs.shape} is not a 2-D array of +1 and -1; use scipy.linalg.hadamard")
-    if not np.array_equal(signs @ signs.T, signs.shape[1] * np.eye(len(signs))):
-        raise MitsimError(f"rows of H, of shape {signs.shape}, are not orthogonal; use rows of a Hadamard matrix")
-    if uniform is None and not (signs[:, 0] == 1).all():
-        raise MitsimError("column 0 of H is not all +1 and no uniform response was given; give one of the two")
-    count, rests = signs.shape[1], (iter(horizontal), iter(vertical))
-
-    def following(side: str, index: int) -> npt.ArrayLike:
-        response = next(rests[side == "vertical"], None)
-        if response is None:
-            raise MitsimError(f"only {index} {side} responses were given; H has {count} columns, give one for each")
-        return response
-
-    both = stripe_sums(following("horizontal", 0), following("vertical", 0), count, centre, uniform)
-    for sums, rest in zip(both, rests, strict=True):
-        while sums.done < count:
-            sums.put(sums.fit_response(following(sums.side, sums.done), sums.done))
-        if next(rest, None) is not None:
-            raise MitsimError(f"more than {count} {sums.side} responses were given; give one for each column of H")
-    return factors_of_sums(*both, signs, noise)
 
 
 def factors_of_sums(
