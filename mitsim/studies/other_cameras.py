@@ -325,8 +325,8 @@ def separable_seconds(bench: Apparatus, k: int) -> float:
 
 
 @cache
-def _psf(file: str | None, variant: str) -> FloatArray:
-    return rendered_psf(_SHAPE, _PITCH_MM, variant) if file is None else load_psf(file, _REDUCE)
+def _psf(file: str | None) -> FloatArray:
+    return rendered_psf(_SHAPE, _PITCH_MM) if file is None else load_psf(file, _REDUCE)
 
 
 def _convolutional_points(scope: Scope) -> Sequence[Point]:
@@ -343,7 +343,7 @@ def _convolutional_points(scope: Scope) -> Sequence[Point]:
 
 def _convolutional_measure(studio: Studio, point: Point) -> Found:
     name, k, seed = point.setup.picture, round(point["patterns"] ** 0.5), int(point["seed"])
-    psf, bench = _psf(point["file"], point.setup.variant), studio.bench(point.setup)
+    psf, bench = _psf(point["file"]), studio.bench(point.setup)
     if name is None:
         truth = studio.lit_scene(point.setup).truth
     else:

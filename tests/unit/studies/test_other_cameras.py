@@ -266,7 +266,7 @@ def test_a_measured_point_spread_function_is_a_parameter_of_the_study_alone() ->
     assert {(point["psf"], point["file"]) for point in points} == {("measured", "psf.tif"), ("rendered", None)}
 
 
-def test_a_rendered_point_spread_function_has_a_sum_of_one(variant: str) -> None:
-    psf = rendered_psf((30, 40), 0.234, variant, rays=256)
+def test_a_rendered_point_spread_function_has_a_sum_of_one() -> None:
+    psf = rendered_psf((30, 40), 0.234, rays=256)
     assert psf.shape == (30, 40) and psf.sum() == pytest.approx(1) and psf.min() >= 0
     assert psf.max() > 5 * psf.mean(), "caustics"
