@@ -477,7 +477,7 @@ def test_samples_are_not_added_up_in_32_bits() -> None:
 # ---- sizes and names -------------------------------------------------------------------------------------------------
 
 SIZES = {
-    "acquire": (5, 1201),
+    "acquire": (5, 1198),
     "api": (2, 188),
     "bench": (5, 1195),
     "calibrate": (5, 1154),
@@ -490,14 +490,14 @@ SIZES = {
     "light": (6, 1672),
     "optics": (7, 1751),
     "planner": (6, 1627),
-    "reconstruct": (16, 5527),
+    "reconstruct": (16, 5496),
     "report": (6, 1906),
     "scene": (5, 1353),
     "sensor": (4, 1105),
     "sessions": (4, 903),
     "studies": (25, 5503),
     "top level": (5, 525),
-    "transport": (15, 3982),
+    "transport": (15, 3948),
 }
 """Files and lines of code of each room. The limits only ever fall: a change that needs more in one room takes it from
 another, and says which code went."""
