@@ -16,6 +16,7 @@ import tomli_w
 from pydantic import Field
 from scipy.optimize import brentq
 
+from mitsim.acquire.exposure import ambient_shots
 from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.layout import before_board
 from mitsim.calibrate.board_session import Session
@@ -150,6 +151,7 @@ def objectives(stand: Stand, goal: Goal, choice: Choice, session_s: float) -> li
     if choice.feature_mm < narrowest:
         problem = f"feature_um: got {choice.feature_mm * 1e3:g}, too narrow for the model of diffraction"
         raise MitsimError(f"goal: {problem}; give at least {narrowest * 1e3:.3g}")
+    lamps, shots = _lamps(stand), 0 if stand.ambient is None else ambient_shots(family)
     depths, found = goal.scene_distances_mm or (bench.geometry.scene_distance,), list[Objective]()
     update: dict[str, Any] = {"mask_feature": choice.feature_mm, "mask_distance": choice.distance_mm}
     camera = _camera(bench, **update, scene_distance=min(depths))
@@ -158,10 +160,10 @@ def objectives(stand: Stand, goal: Goal, choice: Choice, session_s: float) -> li
     for depth in depths:
         camera = _camera(bench, **update, scene_distance=depth)
         directions = [Directions.cells(np.linspace(*window, bench.n + 1)) for window in bench.windows_at(depth)]
-        rows = CodedSide(camera, 0, directions[0], features, shown[0], bench.waves)
+        rows = CodedSide(camera, 0, directions[0], features, shown[0], bench.waves, lamps[0])
         near = np.allclose(directions[0].centres, directions[1].centres, rtol=0, atol=_ALIKE * directions[0].width)
-        alike = camera.axes_alike and near and np.array_equal(shown[0], shown[1])
-        columns = rows if alike else CodedSide(camera, 1, directions[1], features, shown[1], bench.waves)
+        alike = camera.axes_alike and near and np.array_equal(shown[0], shown[1]) and not shots
+        columns = rows if alike else CodedSide(camera, 1, directions[1], features, shown[1], bench.waves, lamps[1])
         for dose in goal.doses:
             light = Light(
                 gain=stand.unit * (bench.geometry.scene_distance / depth) ** 2,
@@ -170,11 +172,27 @@ def objectives(stand: Stand, goal: Goal, choice: Choice, session_s: float) -> li
                 read_noise_e=sensor.superpixel_read_noise_e,
                 dark_e_per_s=sensor.superpixel_dark_current_e_per_s,
                 most_e=_FULL * sensor.superpixel_full_well_e,
+                ambient_shots=shots,
             )
             found.append(Objective((rows, columns), light, prior, scenes))
     if goal.exposures == "light":
         code = Search(found).maximum_length().code
         found = [each.of_equal_light((code, code)) for each in found]
+    return found
+
+
+def _lamps(stand: Stand) -> tuple[list[tuple[Directions, FloatArray]], ...]:
+    """Return the directions of ambient light along both axes, with margins that are relative to a white pixel."""
+    found = tuple(list[tuple[Directions, FloatArray]]() for _ in range(2))
+    estimate, simulation = stand.scene.estimate, stand.scene.simulation
+    if stand.ambient is not None:
+        every = {name: light[[stand.bench.n**2]].toarray().ravel() for name, light in estimate.light.items()}
+        scale = (sum(light.sum() for light in every.values()) * stand.board.pixels.mean()) ** -0.5
+        for name, light in every.items():
+            bundle = simulation.grids[name].bundle
+            if light.any():
+                for axis, each in enumerate(found):
+                    each.append((bundle.directions[axis], scale * light.reshape(bundle.cells).sum(axis=1 - axis)))
     return found
 
 

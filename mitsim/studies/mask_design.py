@@ -170,8 +170,6 @@ def design(
         own = every[best.choice]
         texts = dict.fromkeys(text for each in proved for text in each.warnings)
         warnings = [f"{', '.join(each.name for each in proved if text in each.warnings)}: {text}" for text in texts]
-        if stand.ambient is not None:
-            warnings.append("The search neglects the light of lamps, which predicted and rendered images have")
         if best.rendered < best.predicted - _SHORT_DB:
             short = f"by {best.predicted - best.rendered:.1f} dB; a cause that the prediction lacks matters"
             warnings.append(f"The rendered image is worse than predicted: {short} in this scene")

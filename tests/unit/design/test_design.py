@@ -156,20 +156,22 @@ def test_a_resumed_search_ends_as_one_without_a_stop(stand: Stand, tmp_path: Pat
             search()
 
 
-def test_the_drawn_mask_casts_the_shadow_of_the_code(stand: Stand, tmp_path: Path) -> None:
+def test_the_drawn_mask_casts_the_shadow_of_the_code(tmp_path: Path) -> None:
     """An asymmetric code, so that a mirrored or shifted drawing is seen; the waves' grid errs by 5e-3.
 
-    The predictor, which is another program for the same errors, agrees by cause within 8 %.
+    The predictor, which is another program for the same errors, agrees by cause within 6 % behind lamps, and does not
+    find the full well exceeded. (Planted: weights, profiles and shots of ambient light, groups of pixels.)
     """
+    stand = stand_of(ms.open_bench("lamp_bench", camera="small"), 0)[0]
     (objective,) = objectives(stand, Goal(**GOAL), CHOICE, 0.01)
     side = objective.sides[0]
     code = np.zeros(side.features)
     code[side.used] = np.random.default_rng(1).random(len(side.used)) < 0.3
     file = write_camera(tmp_path / "mask", stand.bench, Candidate("one", CHOICE, Found("drawn", code, 1.0, 0), 4.0))
-    bench = ms.open_bench("photograph", camera=str(file))
+    bench = ms.open_bench("lamp_bench", camera=str(file))
     modelled = ModelledCamera(bench.geometry, bench.windows, bench.n, bench.waves)
     left, _ = modelled.factors(modelled.built)
-    found = side(code).values
+    found = side(code).values.T
     scale = float(np.vdot(found, left) / np.vdot(found, found))
     assert np.linalg.norm(scale * found - left) < 1e-2 * np.linalg.norm(left)
     predicted = bench.predict("dots:3", exposure=objective.frame_s((code, code)))
@@ -177,8 +179,9 @@ def test_the_drawn_mask_casts_the_shadow_of_the_code(stand: Stand, tmp_path: Pat
     parts = objective((code, code), predicted.errors.lam / objective.light.gain**2).parts
     causes = {**predicted.errors.causes}
     causes["dark_and_read_noise"] = causes["dark_current"] + causes["read_noise"]
-    for name in ("shot_noise", "dark_and_read_noise", "calibration_noise", "regularisation_bias"):
-        assert parts[name] == pytest.approx(causes[name], rel=0.1), name
+    for name in ("shot_noise", "dark_and_read_noise", "calibration_noise", "ambient_light", "regularisation_bias"):
+        assert parts[name] == pytest.approx(causes[name], rel=0.07), name
+    assert objective.frame_s((code, code)) < objective.light.frame_s and not predicted.warnings
     assert (tmp_path / "mask" / "mask.svg").read_text().count("<rect") == np.count_nonzero(np.diff(code) == 1) ** 2
 
 
@@ -189,7 +192,7 @@ def test_equal_light_exposes_a_darker_mask_for_longer(stand: Stand) -> None:
     half[search.used[::4]] = 1
     signals = []
     for code in (full, half):
-        factor, pattern = objective.sides[0](code).values, objective.sides[0].patterns
+        factor, pattern = objective.sides[0](code).values.T, objective.sides[0].patterns
         signals.append(objective.frame_s((code, code)) * (factor.mean(axis=0) @ pattern.mean(axis=1)) ** 2)
     assert signals[0] == pytest.approx(signals[1], rel=1e-6)
     assert objective.frame_s((full, full)) == pytest.approx(0.4 / 9, rel=1e-12)

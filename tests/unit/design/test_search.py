@@ -22,16 +22,19 @@ N, PIXELS = 16, 24
 WINDOW = (-0.15, 0.15)
 CAMERA = CameraGeometry(pixels=PIXELS, pixel_pitch=0.05, mask_feature=0.06, mask_distance=2.0, scene_distance=400.0)
 LINES = Spectrum(np.array([640.0, 520.0]), np.array([0.6, 0.4]))
-DOTS = (np.arange(N)[:, None] % 4 == np.arange(4)).astype(np.float64)
+DOTS = (np.arange(N)[:, None] % 5 == np.arange(5)).astype(np.float64)
 LIGHT = Light(gain=3e4, frame_s=0.5, session_frame_s=0.05, read_noise_e=13.0, dark_e_per_s=6.0)
 FEATURES = 39
 SCENES = Prior().draw((N, N), 0)
 CODE = (np.random.default_rng(3).random(FEATURES) < 0.4).astype(np.float64)
 
 
-def side(spectrum: Spectrum | None = None, patterns: FloatArray = DOTS) -> CodedSide:
+LAMPS = [(Directions.cells(np.linspace(-0.2, 0.1, 7)), np.array([0.1, 0.3, 0.6, 0.9, 0.5, 0.2]))]
+
+
+def side(spectrum: Spectrum | None = None, patterns: FloatArray = DOTS, lit: bool = False) -> CodedSide:
     directions = Directions.cells(np.linspace(*WINDOW, N + 1))
-    return CodedSide(CAMERA, 0, directions, FEATURES, patterns, spectrum)
+    return CodedSide(CAMERA, 0, directions, FEATURES, patterns, spectrum, LAMPS if lit else ())
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +50,7 @@ def test_a_factor_is_that_of_the_modelled_camera(spectrum: Spectrum | None, erro
     worn = CAMERA.model_copy(update={"mask": "plate", "mask_plate": plate})
     modelled = ModelledCamera(worn, (WINDOW, WINDOW), N, spectrum)
     left, _ = modelled.factors(modelled.built)
-    found = side(spectrum)(CODE).values
+    found = side(spectrum)(CODE).values.T
     scale = float(np.vdot(found, left) / np.vdot(found, found))
     assert np.linalg.norm(scale * found - left) < error * np.linalg.norm(left)
 
@@ -56,13 +59,17 @@ def test_a_factor_is_that_of_the_modelled_camera(spectrum: Spectrum | None, erro
     ("spectrum", "exposure"), [(None, {}), (LINES, {}), (None, {"signal_e": 2e3}), (LINES, {"most_e": 2e4})]
 )
 def test_the_gradient_of_a_code_agrees_with_differences(spectrum: Spectrum | None, exposure: dict[str, float]) -> None:
-    """Two codes and sides of other patterns, grey codes, exposures by time, light and full well: 1e-8 is usual."""
-    random, small = np.random.default_rng(4), 1e-5
-    sides = side(spectrum), side(spectrum, 1 - DOTS)
+    """Two codes and sides of other patterns, grey codes, exposures by time, light and full well: 1e-8 is usual.
+
+    Dots have groups of 4 and of 3 pixels. All but the first have light of lamps.
+    """
+    random, small, lit = np.random.default_rng(4), 1e-5, spectrum is not None or bool(exposure)
+    exposure = exposure | {"ambient_shots": 2 * lit}
+    sides = side(spectrum, lit=lit), side(spectrum, 1 - DOTS, lit)
     objective = Objective(sides, replace(LIGHT, **exposure), Prior(), SCENES)
     codes = random.random((2, FEATURES))
     found = objective(codes, slopes=True)
-    assert (objective.frame_s(codes) == LIGHT.frame_s) != bool(exposure)
+    assert (objective.frame_s(codes) == LIGHT.frame_s) != (len(exposure) > 1)
     for which in (0, 1):
         step = np.zeros((2, FEATURES))
         step[which] = random.standard_normal(FEATURES)
