@@ -50,13 +50,10 @@ Row = dict[str, Any]
 CAPTURE, SCENE, SOLVER, UNEXPLAINED = "capture", "scene", "solver", "unexplained"
 RENDERING, LAMBDA, REST = "rendering", "lambda and resolution", "all else"
 ERROR_SOURCES = {
-    waterfall.DETAIL: "detail inside projector pixels",
-    waterfall.DEPTH: "depth beside the board's",
-    waterfall.OCCLUSION: "edges that hide pixels from part of the sensor",
-    waterfall.INTERREFLECTION: "light over several surfaces",
-    waterfall.MIRRORS: "light over mirrors",
-    waterfall.GLOSS: "gloss over the sensor",
-    waterfall.BLACK_LEVEL: "light that black pixels leak",
+    "interreflection": "light over several surfaces",
+    "mirrors": "light over mirrors",
+    "black-level": "light that black pixels leak",
+    waterfall.SCENE: "depth, gloss, edges and detail",
 }
 """Effects that factors lack, in the order of their removal."""
 SURE = 3.0
@@ -96,7 +93,7 @@ def losses(stand: DriftStand, lit: LitSession, clear: Factors) -> list[Row]:
     for name, more in stand.fixed.items():
         parts[CAPTURE, name] = _square(error + more) - _square(error), 0.0
         error = error + more
-    parts[SCENE, ERROR_SOURCES[waterfall.DETAIL]] = 0.0, 0.0
+    parts[SCENE, ERROR_SOURCES[waterfall.SCENE]] = 0.0, 0.0
     for name, before, after in zip(removed, seen, seen[1:], strict=False):
         moved = scatter.common(sampled, before - after) / pixels
         parts[SCENE, ERROR_SOURCES[name]] = _square(before - scene) - _square(after - scene), moved

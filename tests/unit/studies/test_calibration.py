@@ -41,7 +41,7 @@ from mitsim.studies.drift_study import AMBIENT, SESSION
 from mitsim.studies.framework.experiment import Point, Results, Scope, Setup
 from mitsim.studies.framework.panels import flag_warnings
 from mitsim.studies.framework.studio import Studio
-from mitsim.studies.waterfall_study import DEPTH, GLOSS
+from mitsim.studies.waterfall_study import SCENE
 from tests.unit.calibrate.test_responses import CLIPPED, EXPOSURE_S, ToyLight, lit_session
 
 N = 4
@@ -157,8 +157,8 @@ def test_parts_of_an_image_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
         ("capture", RENDERING): Noise(light=3e-4),
         ("session", RENDERING): Noise(left_light=4e-4),
     }
-    effects = "falloff", GLOSS, DEPTH
-    errors = {(): 0.1, (DEPTH,): 0.08, (DEPTH, GLOSS): 0.05}
+    effects = "falloff", "mirrors", SCENE
+    errors = {(): 0.1, ("mirrors",): 0.08, ("mirrors", SCENE): 0.05}
     off = {names: size * RNG.standard_normal((N, N)) for names, size in errors.items()}
     ablation = SimpleNamespace(effects=effects, without=lambda names: tuple(sorted(names)))
     monkeypatch.setattr(module.waterfall, "Ablation", lambda light: ablation)
@@ -184,16 +184,16 @@ def test_parts_of_an_image_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
     for name, before, after in zip(fixed, squares, squares[1:], strict=False):
         assert found["capture", name]["squared_error"] == pytest.approx(after - before)
         assert found["capture", name]["deviation"] == 0
-    for name, before, after in zip((DEPTH, GLOSS), squares[3:], squares[4:], strict=False):
+    for name, before, after in zip(("mirrors", SCENE), squares[3:], squares[4:], strict=False):
         assert found["scene", ERROR_SOURCES[name]]["squared_error"] == pytest.approx(before - after)
     sampled = Noise(light=3e-4, left_light=4e-4)
-    moved = scatter.common(sampled, off[()] - off[DEPTH,]) / N**2
-    assert found["scene", ERROR_SOURCES[DEPTH]]["deviation"] == pytest.approx(moved)
+    moved = scatter.common(sampled, off[()] - off["mirrors",]) / N**2
+    assert found["scene", ERROR_SOURCES["mirrors"]]["deviation"] == pytest.approx(moved)
     bias = float(np.mean((exact.expected_image(scene).image - scene) ** 2))
     assert found["solver", LAMBDA]["squared_error"] == pytest.approx(bias)
     rest = squares[5] - bias - exact.variance(scene, sampled) / N**2
     assert found["scene", REST]["squared_error"] == pytest.approx(rest)
-    assert found["scene", REST]["deviation"] == pytest.approx(scatter.deviation(sampled, off[DEPTH, GLOSS]) / N**2)
+    assert found["scene", REST]["deviation"] == pytest.approx(scatter.deviation(sampled, off["mirrors", SCENE]) / N**2)
     explained = sum(row["squared_error"] for row in rows[:-1])
     assert last["squared_error"] == pytest.approx(0.01 - explained)
     assert last["deviation"] == pytest.approx(scatter.deviation(drawn, steps[2]) / N**2)
@@ -295,13 +295,13 @@ def test_detail_inside_projector_pixels_is_told_from_all_else(small_scene: Calla
     found, rows = losses_of(small_scene("squares", reflectance=print_of_squares(1.5)), variant)
     (image,) = of_kind(found, "image")
     whole = 10 ** (-image["psnr_db"] / 10)
-    detail, left = rows["scene: detail inside projector pixels"], rows["not explained"]
+    detail, left = rows["scene: depth, gloss, edges and detail"], rows["not explained"]
     assert 0.95 < detail["squared_error"] / whole < 1 and detail["lost_db"] > 13
     assert abs(left["squared_error"]) < 3 * left["deviation"] < 0.03 * whole and not image["flagged"]
     assert image["predicted_psnr_db"] == pytest.approx(image["psnr_db"], abs=0.1)
     assert abs(rows["scene: all else"]["squared_error"]) < 0.01 * whole
     even = losses_of(small_scene("even"), variant)[1]
-    assert abs(even["scene: detail inside projector pixels"]["lost_db"]) < 0.1
+    assert abs(even["scene: depth, gloss, edges and detail"]["lost_db"]) < 0.1
     assert abs(even["scene: all else"]["squared_error"]) < 0.5 * even["capture: rendering"]["squared_error"]
 
 
