@@ -2,6 +2,7 @@
 other studies."""
 
 from collections.abc import Callable, Iterator
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -61,7 +62,7 @@ def test_steps_add_up_to_the_rendered_image(studio: Studio, setup: Setup) -> Non
              for name in EFFECTS]  # fmt: skip
     assert [row["effect"] for row in found if row["called_for"]] == [FALLOFF, "diffraction", SCENE]
     assert found[0]["without_db"] == found[0]["ideal_db"]
-    for one, following in zip(found, found[1:], strict=False):
+    for one, following in pairwise(found):
         assert one["with_db"] == following["without_db"]
     whole = assumed_image(studio.lit_scene(setup).light, FAMILY, 3).image
     assert found[-1]["with_db"] == psnr(whole, studio.lit_scene(setup).truth)
