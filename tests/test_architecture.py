@@ -495,7 +495,7 @@ SIZES = {
     "scene": (5, 1353),
     "sensor": (4, 1105),
     "sessions": (4, 903),
-    "studies": (25, 5501),
+    "studies": (25, 5270),
     "top level": (5, 525),
     "transport": (15, 3948),
 }

@@ -79,9 +79,7 @@ def assumed_image(light: SampledLight, patterns: str, seed: int) -> Reconstructi
     """Return the image of light, exposed at equal peak, by the exact factors of the idealised camera."""
     bench, shots = light.bench, expose(light, patterns, seed=seed)
     sides = IdealCamera(bench, bench.geometry.mask).calibrated(float(light.apparent.board_flux.mean()))
-    manifest = CalibrationManifest(
-        camera=shots.manifest.camera, centre=bench.geometry.centred, parallax=bench.parallax
-    )
+    manifest = CalibrationManifest(camera=shots.manifest.camera, centre=bench.geometry.centred, parallax=bench.parallax)
     return reconstruct(shots, Factors(*sides, manifest, Status(Verdict.CALIBRATED, "Factors of the idealised camera")))
 
 
