@@ -492,7 +492,7 @@ SIZES = {
     "planner": (6, 1627),
     "reconstruct": (16, 5496),
     "report": (6, 1906),
-    "scene": (5, 1353),
+    "scene": (5, 1349),
     "sensor": (4, 1105),
     "sessions": (4, 903),
     "studies": (25, 5270),
