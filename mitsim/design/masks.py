@@ -6,7 +6,7 @@ import itertools
 import math
 import re
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import astuple, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ from scipy.optimize import brentq
 from mitsim.acquire.exposure import ambient_shots
 from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.layout import before_board
-from mitsim.calibrate.board_session import Session
+from mitsim.bench.request import PredictRequest
 from mitsim.core.arrays import FloatArray
 from mitsim.core.configuration import Configuration, validate
 from mitsim.core.errors import MitsimError
@@ -30,7 +30,7 @@ from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.seeds import stream
 from mitsim.design.goal import Goal
 from mitsim.design.objective import CodedSide, Light, Objective, Prior, cyclic_patterns
-from mitsim.design.predict import Stand, TracedLight
+from mitsim.design.predict import CELLS, Stand, TracedLight, scenes_of
 from mitsim.design.search import Found, Search
 from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.patterns import PatternFamily, short_name
@@ -81,7 +81,10 @@ class Candidate:
     name: str
     choice: Choice
     found: Found
-    exposure_total_s: float
+    exposures: tuple[float, ...]
+    """Seconds of all frames, for each dose."""
+    cases: tuple[Mapping[str, Any], ...] = ()
+    """Predicted and rendered PSNR [dB] of each picture and dose."""
     predicted: float = math.nan
     causes: Mapping[str, float] = field(default_factory=dict)
     rendered: float = math.nan
@@ -99,7 +102,8 @@ class Candidate:
             "origin": self.found.origin,
             "code": _text(self.found.code),
             "evaluations": self.found.evaluations,
-            "exposure_total_s": self.exposure_total_s,
+            "exposure_total_s": self.exposures[0],
+            "cases": self.cases,
             "psnr_of_search": self.found.psnr_db,
             "psnr_predicted": self.predicted,
             "causes": self.causes,
@@ -119,27 +123,29 @@ def _camera(bench: Apparatus, **update: Any) -> CameraGeometry:
     return validate(CameraGeometry, {**dict(bench.geometry), **bare}, "goal")
 
 
-def stand_of(bench: Apparatus, seed: int) -> tuple[Stand, float]:
-    """Trace the light of a scene and of its white board, and return them with the session's exposure time [s].
-
-    The bench, which may have any mask, gets a thin separable one.
-    """
+def stand_of(bench: Apparatus, seed: int) -> Stand:
+    """Trace the light of a scene and of its white board; the bench, of any mask, gets a thin separable one."""
     bench.loaded.camera.wear(_camera(bench))
-    bench, recipe = replace(bench, devices=replace(bench.devices, camera=_camera(bench))), load_recipe().of_one_depth()
+    bench, recipe = replace(bench, devices=replace(bench.devices, camera=_camera(bench))), load_recipe()
     board = TracedLight.of(before_board(bench, recipe.board_reflectance), seed)
     stand = Stand(bench, TracedLight.of(bench, seed), board)
     if not (stand.unit > 0 and stand.truth.any()):
         problem = f"scene {bench.loaded.path}: no light of the projector comes from it to the camera"
         raise MitsimError(f"{problem}, so that no mask is better than another; give another scene")
-    return stand, stand.session_noise(Session(bench, recipe, seed))[1]
+    return stand
 
 
 @single_threaded_blas()
-def objectives(stand: Stand, goal: Goal, choice: Choice, session_s: float) -> list[Objective]:
+def objectives(stand: Stand, goal: Goal, choice: Choice) -> list[Objective]:
     """Return the objectives of a ``choice``, one for each dose and distance."""
     bench, sensor = stand.bench, stand.bench.sensor
-    family, prior = choice.family(bench), prior_of(stand, goal)
-    scenes = [stand.truth] if goal.prior is None else prior.draw(stand.truth.shape, goal.seed)
+    family, pictures = choice.family(bench), PredictRequest(pictures=goal.pictures)
+    scenes = [each.pixels(CELLS) for _, each in scenes_of(pictures, stand)]
+    if goal.prior is not None:
+        prior = Prior(*goal.prior)
+        judged = [(prior, prior.draw(stand.truth.shape, goal.seed))]
+    else:
+        judged = [(prior_of(each), each) for each in ([[one] for one in scenes] if goal.judge == "worst" else [scenes])]
     if family.signed:
         problem = f"patterns: got {choice.patterns!r}, which are differences of two frames, and a search knows single"
         raise MitsimError(f"goal: {problem} ones; give uniform, dots:K, random:K or own patterns")
@@ -168,13 +174,13 @@ def objectives(stand: Stand, goal: Goal, choice: Choice, session_s: float) -> li
             light = Light(
                 gain=stand.unit * (bench.geometry.scene_distance / depth) ** 2,
                 frame_s=goal.exposure_total_s * dose / len(family.shots),
-                session_frame_s=session_s,
+                session_e=load_recipe().exposure_fraction * sensor.superpixel_full_well_e,
                 read_noise_e=sensor.superpixel_read_noise_e,
                 dark_e_per_s=sensor.superpixel_dark_current_e_per_s,
                 most_e=_FULL * sensor.superpixel_full_well_e,
                 ambient_shots=shots,
             )
-            found.append(Objective((rows, columns), light, prior, scenes))
+            found += [Objective((rows, columns), light, *each) for each in judged]
     if goal.exposures == "light":
         code = Search(found).maximum_length().code
         found = [each.of_equal_light((code, code)) for each in found]
@@ -196,20 +202,15 @@ def _lamps(stand: Stand) -> tuple[list[tuple[Directions, FloatArray]], ...]:
     return found
 
 
-def prior_of(stand: Stand, goal: Goal) -> Prior:
-    """Return the goal's prior, or mean, deviation and correlation of the scene's apparent reflectance."""
-    if goal.prior is not None:
-        return Prior(*goal.prior)
-    truth = stand.truth
-    off, variance = truth - truth.mean(), float(truth.var())
+def prior_of(scenes: Sequence[FloatArray]) -> Prior:
+    """Return mean, deviation and correlation of the apparent reflectance of scenes."""
+    mean = float(np.mean(scenes))
+    off = np.stack(scenes) - mean
+    variance = float(np.square(off).mean())
     if not variance:
-        return Prior(float(truth.mean()), 0.0, 0.5)
-    neighbours = (off[1:] * off[:-1]).mean(), (off[:, 1:] * off[:, :-1]).mean()
-    return Prior(float(truth.mean()), variance**0.5, float(np.clip(np.mean(neighbours) / variance, 0.0, 0.999)))
-
-
-def search_of(stand: Stand, goal: Goal, choice: Choice, session_s: float) -> Search:
-    return Search(objectives(stand, goal, choice, session_s), goal.open_part, goal.judge == "worst", goal.seed)
+        return Prior(mean, 0.0, 0.5)
+    neighbours = (off[:, 1:] * off[:, :-1]).mean(), (off[:, :, 1:] * off[:, :, :-1]).mean()
+    return Prior(mean, variance**0.5, float(np.clip(np.mean(neighbours) / variance, 0.0, 0.999)))
 
 
 class _Start(Configuration):
@@ -226,18 +227,17 @@ class _State(Configuration):
     starts: dict[str, list[_Start]] = Field(default_factory=dict)
 
 
-def searches(stand: Stand, goal: Goal, session_s: float) -> dict[Choice, Search]:
+def searches(stand: Stand, goal: Goal) -> dict[Choice, Search]:
     """Return each choice of feature size, distance and family with its search."""
     distances = goal.mask_distance_mm or (stand.bench.geometry.mask_distance,)
     options = itertools.product(goal.feature_um, distances, goal.families)
     order = [Choice(feature * 1e-3, distance, patterns) for feature, distance, patterns in options]
-    return {choice: search_of(stand, goal, choice, session_s) for choice in order}
+    known = goal.open_part, goal.judge == "worst", goal.seed
+    return {choice: Search(objectives(stand, goal, choice), *known) for choice in order}
 
 
 @single_threaded_blas()
-def run_search(
-    stand: Stand, goal: Goal, folder: Path, job: Job, session_s: float, every: dict[Choice, Search]
-) -> tuple[list[Candidate], bool]:
+def run_search(goal: Goal, folder: Path, job: Job, every: dict[Choice, Search]) -> tuple[list[Candidate], bool]:
     """Return the best masks: the found one, then simple ones; and whether all starts were made; add to ``every``.
 
     Starts that are done are in ``search.json``, from which a search that was stopped goes on. For cyclic patterns,
@@ -283,7 +283,7 @@ def run_search(
             changed = replace(choice, patterns=cyclic, lit=lit)
             if lit.count("1") > 1 and changed not in every:  # a single 1 is dots
                 order.append(changed)
-                every[changed] = search_of(stand, goal, changed, session_s)
+                every[changed] = search.lit_by(lit)
                 known_masks[changed] = [(f"the mask for {choice.shown}", mask.code)]
                 keep("design", changed, replace(mask, score=every[changed].score(mask.code).score), every[changed])
         keep("random", choice, search.best_random(spent), search)
@@ -293,9 +293,12 @@ def run_search(
         del best[FOR_DOTS]
     candidates = []
     for name, (choice, found, search) in best.items():
-        objective = search.objectives[0]
-        longer = objective.frame_s((found.code, found.code)) / objective.light.frame_s
-        candidates.append(Candidate(name, choice, found, goal.exposure_total_s * longer))
+        each = len(search.objectives) // max(len(goal.scene_distances_mm), 1) // len(goal.doses)  # pictures
+        longer = [one.frame_s((found.code, found.code)) / one.light.frame_s for one in search.objectives]
+        exposures = (
+            goal.exposure_total_s * dose * min(longer[k * each : (k + 1) * each]) for k, dose in enumerate(goal.doses)
+        )
+        candidates.append(Candidate(name, choice, found, tuple(exposures)))
     return candidates, complete
 
 
@@ -349,6 +352,16 @@ def sensitivity(search: Search, code: FloatArray) -> dict[str, float]:
     flaws, dark = float(np.mean(worse)) / here, _score(search, code, 0.1) / here
     losses = {"one feature in a hundred wrong": flaws, "a tenth of the light": dark}
     return {name: -10 * math.log10(loss) for name, loss in losses.items()}
+
+
+def by_distance(search: Search, code: FloatArray, goal: Goal) -> dict[str, float]:
+    """Return the expected PSNR [dB] at each distance of the goal, as it is judged over doses and pictures."""
+    count, found = len(goal.scene_distances_mm), dict[str, float]()
+    for number, distance in enumerate(goal.scene_distances_mm):
+        part = len(search.objectives) // count
+        own = replace(search, objectives=search.objectives[number * part : (number + 1) * part])
+        found[f"at {distance:g} mm"] = -10 * math.log10(own.score(code).score)
+    return found
 
 
 def _score(search: Search, code: FloatArray, longer: float) -> float:

@@ -21,7 +21,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-import numpy.typing as npt
 from scipy.fft import fft, ifft, next_fast_len
 from scipy.sparse import csr_array, eye_array, kron
 from scipy.sparse.csgraph import connected_components
@@ -74,20 +73,20 @@ class Light:
     """Light and electronics of a capture and of its calibration session.
 
     ``gain`` is in electrons per second from a projector pixel on a sensor pixel without a mask, for a reflectance of 1.
-    ``frame_s`` and ``session_frame_s`` are exposure times of one frame. With ``signal_e``, the mean electrons of a
-    pixel and frame, exposures are of equal light instead: a mask that transmits less is exposed for longer. No pixel
-    gets more than ``most_e``: a mask that transmits more is exposed for a shorter time. ``ambient_shots`` are the
-    shots of the ambient frame that is subtracted from all frames, 0 for none.
+    ``frame_s`` is the exposure time of one frame, and ``session_e`` are electrons of the brightest pixel of a session.
+    With ``signal_e``, the mean electrons of a pixel and frame, exposures are of equal light instead: a mask that
+    transmits less is exposed for longer. No pixel gets more than ``most_e``: a mask that transmits more is exposed for
+    a shorter time. ``ambient_shots`` are those of the ambient frame that is subtracted from all frames, 0 for none.
     """
 
     gain: float
     frame_s: float
-    session_frame_s: float
+    session_e: float
     read_noise_e: float
     dark_e_per_s: float
     signal_e: float | None = None
     most_e: float = math.inf
-    ambient_shots: int = 0
+    ambient_shots: float = 0.0
 
 
 class CodedSide:
@@ -158,16 +157,18 @@ class CodedSide:
         """
         self.patterns = patterns
         label = connected_components(csr_array(patterns @ patterns.T))[1]
-        if np.bincount(label).max() * (label.max() + 1) > 2 * len(label):
-            label[:] = 0
         groups = [np.flatnonzero(label == each) for each in range(label.max() + 1)]
-        self.pixels, self.real = _filled_up(groups)
-        shown, own = _filled_up([np.flatnonzero(patterns[each].any(axis=0)) for each in groups])
-        lit = patterns[self.pixels[:, :, None], shown[:, None, :]]
-        self.lit = lit * self.real[:, :, None] * own[:, None, :]
+        shown = [np.flatnonzero(patterns[each].any(axis=0)) for each in groups]
+        if len({*map(len, shown)}) > 1 or len(groups) * max(map(len, groups)) > 2 * len(label):
+            groups, shown = ([np.arange(count)] for count in patterns.shape)
+        size = max(map(len, groups))
+        self.pixels = np.array([np.resize(each, size) for each in groups])
+        self.real = np.arange(size) < np.array([[len(each)] for each in groups])
+        self.lit = patterns[self.pixels[:, :, None], np.array(shown)[:, None, :]] * self.real[:, :, None]
         self.gram = self.lit @ self.lit.mT
         self.squared, total = self.gram @ self.gram, self.lit.sum(axis=2)
         self.summed = total[:, :, None] * total[:, None, :]
+        self.overlap = np.square(total).sum() / np.square(self.lit).sum()
 
     def grouped(self, matrix: FloatArray) -> FloatArray:
         """Return the blocks (groups, size, size) of a matrix (n, n)."""
@@ -201,13 +202,6 @@ class CodedSide:
         gram, reused, summed = cross * self.gram, cross * self.squared, cross * self.summed
         inside, dimmed = detail @ detail.mT, (own * ambient) @ own.mT * self.gram
         return Factor(values, ambient, back, own, moved, bright, gram, detail, inside, reused, shot, dimmed, summed)
-
-
-def _filled_up(groups: Sequence[npt.NDArray[np.intp]]) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.bool_]]:
-    """Return lists as rows of equal length, and True where they have an entry of their own."""
-    size = max(map(len, groups))
-    real = np.arange(size) < np.array([len(each) for each in groups])[:, None]
-    return np.array([np.resize(each, size) for each in groups], dtype=np.intp), real
 
 
 @dataclass(frozen=True, eq=False)
@@ -332,11 +326,12 @@ class Objective:
         """Return the objective for cyclic patterns of a code, as many as the patterns before, in the same time."""
         rows = self.sides[0].lit_by(lit)
         sides = rows, (rows if self.sides[0] is self.sides[1] else self.sides[1].lit_by(lit))
-        signal_e = self.light.signal_e
-        if signal_e is not None:  # that of the mask by which light is equal
-            for new, old in zip(sides, self.sides, strict=True):
-                signal_e *= new.patterns.mean() / old.patterns.mean()
-        return replace(self, sides=sides, light=replace(self.light, signal_e=signal_e))
+        light = self.light
+        for new, old in zip(sides, self.sides, strict=True):
+            if light.signal_e is not None:  # that of the mask by which light is equal
+                light = replace(light, signal_e=light.signal_e * new.patterns.mean() / old.patterns.mean())
+            light = replace(light, ambient_shots=light.ambient_shots * new.overlap / old.overlap)
+        return replace(self, sides=sides, light=light)
 
     def __call__(self, codes: Sequence[FloatArray], lam: float | None = None, slopes: bool = False) -> Value:
         light, prior, sides = self.light, self.prior, self.sides
@@ -346,17 +341,18 @@ class Objective:
         factors = [stack.values for stack in stacks]
         (one, covariance, second), others = self._matrices
         seconds, exposed = self._exposure(stacks)
-        electrons, session = light.gain * seconds, light.gain * light.session_frame_s
+        electrons = light.gain * seconds
         noise = light.read_noise_e**2 / electrons**2 + light.dark_e_per_s / light.gain / electrons
         lamps = [float(stack.ambient.mean()) for stack in stacks]
         once, ambient = 1 / light.ambient_shots if light.ambient_shots else 0.0, lamps[0] * lamps[1] / electrons
         # A side's numbers are means over the other's response, and so is the light of both shots of a pair.
         common = [factor.sum(axis=0) for factor in factors]
         norms = [float(each @ each) for each in common]
-        full = [float(each.mean()) for each in common]
+        full, peaks = [float(each.mean()) for each in common], [float(each.max()) for each in common]
         cubed = [float(np.sum(each**3)) / norm for each, norm in zip(common, norms, strict=True)]
-        response = 2 * (light.read_noise_e**2 + light.dark_e_per_s * light.session_frame_s) / session**2
-        errors = [(response + full[k] * cubed[1 - k] / session) / len(factors[k]) / norms[1 - k] for k in (0, 1)]
+        session = light.session_e / (peaks[0] * peaks[1])
+        read, dark = 2 * light.read_noise_e**2 / session**2, 2 * light.dark_e_per_s / light.gain / session
+        errors = [(read + dark + full[k] * cubed[1 - k] / session) / len(factors[k]) / norms[1 - k] for k in (0, 1)]
         moment = prior.deviation**2 * (1 - prior.correlation) * _MOMENT
         causes = [
             Cause("dark_and_read_noise", (1, 1), (one, others[0]), noise),
@@ -396,11 +392,14 @@ class Objective:
                 by_factor -= by_exposure * np.outer(*exposed[k][:2])
                 by_ambient -= by_exposure * exposed[k][2]
             by_errors = [by_weight[2 + side] / len(factors[side]) / norms[1 - side] for side in (0, 1)]
-            by_factor += by_errors[k] * cubed[other] / session / len(by_ambient)
-            by_cubed = (3 * common[k] - 2 * cubed[k]) * common[k] / norms[k]
-            by_factor += by_errors[other] * full[other] / session * by_cubed
+            by_session = [2 * read + dark + full[side] * cubed[1 - side] / session for side in (0, 1)]
             # The error of the other factor falls with the norm of this side's common response.
-            by_factor -= 2 * by_weight[2 + other] * errors[other] / norms[k] * common[k]
+            by_cubed = (3 * common[k] - 2 * cubed[k]) * common[k] / norms[k]
+            by_common = by_errors[other] * full[other] / session * by_cubed
+            by_common -= 2 * by_weight[2 + other] * errors[other] / norms[k] * common[k]
+            by_common += by_errors[k] * cubed[other] / session / len(by_common)
+            by_common[np.argmax(common[k])] += float(np.dot(by_errors, by_session)) / peaks[k]
+            by_factor += by_common
             gradients.append(stack.back(by_factor, by_derivative, by_ambient) / pixels)
         return Value(value.parts, found.lam, (gradients[0], gradients[1]))
 

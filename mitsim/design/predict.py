@@ -315,7 +315,7 @@ def predict(bench: Apparatus, asked: PredictRequest, job: Job | None = None) -> 
         stand = Stand(bench, scene, TracedLight.of(before_board(bench, recipe.board_reflectance), asked.seed))
     with job.clock.stage("predict"):
         found, lam = list[tuple[str, Predictor, Errors]](), asked.weight
-        for name, each in _scenes(asked, stand):
+        for name, each in scenes_of(asked, stand):
             model = stand.predictor(each, family, session, asked)
             if not (name or asked.prior):
                 model.seen = stand.seen(model, family)
@@ -341,7 +341,8 @@ def predict(bench: Apparatus, asked: PredictRequest, job: Job | None = None) -> 
     )
 
 
-def _scenes(asked: PredictRequest, stand: Stand) -> Iterator[tuple[str, Scene]]:
+def scenes_of(asked: PredictRequest, stand: Stand) -> Iterator[tuple[str, Scene]]:
+    """Yield names and scenes: the prior's, those of pictures, or the bench's own."""
     side = CELLS * stand.bench.n
     if asked.prior is not None:
         mean, variance, length = asked.prior

@@ -23,7 +23,7 @@ WINDOW = (-0.15, 0.15)
 CAMERA = CameraGeometry(pixels=PIXELS, pixel_pitch=0.05, mask_feature=0.06, mask_distance=2.0, scene_distance=400.0)
 LINES = Spectrum(np.array([640.0, 520.0]), np.array([0.6, 0.4]))
 DOTS = (np.arange(N)[:, None] % 5 == np.arange(5)).astype(np.float64)
-LIGHT = Light(gain=3e4, frame_s=0.5, session_frame_s=0.05, read_noise_e=13.0, dark_e_per_s=6.0)
+LIGHT = Light(gain=3e4, frame_s=0.5, session_e=1e5, read_noise_e=13.0, dark_e_per_s=6.0)
 FEATURES = 39
 SCENES = Prior().draw((N, N), 0)
 CODE = (np.random.default_rng(3).random(FEATURES) < 0.4).astype(np.float64)
@@ -88,6 +88,12 @@ def test_a_search_beats_simple_masks_and_repeats_bit_by_bit(objective: Objective
     assert best.score < search.best_random(spent).score
     pinholes_ = search.best_pinholes()
     assert pinholes_ is not None and best.score <= pinholes_.score
+    done = search.improve("here", found[0].code, evaluations=3000)
+    assert done.evaluations < 3000 and done.score <= found[0].score
+    for place in search.used:
+        other = done.code.copy()
+        other[place] = 1 - other[place]
+        assert search.score(other).score > done.score * (1 - 1e-4)
     again = Search([objective], seed=1)
     second = again.improve(*list(islice(again.starts(), 2))[1], evaluations=120)
     assert second.score == found[1].score and np.array_equal(second.code, found[1].code)
@@ -146,3 +152,4 @@ def test_codes_have_difference_sets(period: int, count: int, code: str) -> None:
 
 def test_pinholes_are_equal_and_centred() -> None:
     assert pinholes(9, 4, 1).tolist() == [1, 0, 0, 0, 1, 0, 0, 0, 1]
+    assert pinholes(9, 4, 2).tolist() == [1, 0, 0, 1, 1, 0, 0, 1, 1]
