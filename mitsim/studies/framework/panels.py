@@ -358,7 +358,10 @@ class Part:
 
 @dataclass(frozen=True)
 class Section:
-    """One study on a page; ``pictures`` has data URI and width [pixels] of figures by file name."""
+    """One study on a page; ``pictures`` has data URI and width [pixels] of figures by file name.
+
+    ``pages`` has the contents of further pages by their places.
+    """
 
     name: str
     title: str
@@ -377,6 +380,7 @@ class Section:
     prints: int = 0
     scene: str = ""
     camera: str = ""
+    pages: Mapping[str, str] = field(default_factory=dict)
 
 
 def section_of(
