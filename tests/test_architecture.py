@@ -491,11 +491,11 @@ SIZES = {
     "optics": (7, 1751),
     "planner": (6, 1627),
     "reconstruct": (16, 5496),
-    "report": (6, 1906),
+    "report": (6, 1798),
     "scene": (5, 1349),
     "sensor": (4, 1105),
     "sessions": (4, 903),
-    "studies": (25, 5291),
+    "studies": (25, 5307),
     "top level": (5, 525),
     "transport": (15, 3948),
 }
