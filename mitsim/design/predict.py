@@ -195,24 +195,31 @@ class Stand:
 
     def predictor(self, scene: Scene, family: PatternFamily, session: Session, asked: PredictRequest) -> Predictor:
         """Return the predictor of a ``scene`` under a ``family``, exposed as it is ``asked``."""
-        sensor, ambient = self.bench.sensor, self.ambient
+        ambient = self.ambient
         shown = family.left.astype(np.float64), family.right.astype(np.float64)
         peak = self.camera.brightest(scene, shown, 0.0 if ambient is None else ambient)
         timing = asked.timing
         if asked.exposure_total is not None:
             timing = Exposure(asked.exposure_total / len(family.shots))
         exposure_s = timing.choose(self.bench.devices, peak / self._rate(1.0))
-        dark, digital = sensor.superpixel_dark_current_e_per_s, digital_of(sensor, exposure_s)
-        noise = Noise(
-            seconds=exposure_s,
-            dark=dark,
-            read=float(digital.variance(0.0)) * exposure_s**2 - dark * exposure_s,
-            uneven=response_variance(sensor) + self.bench.speckle(family) ** 2,
-            factors=self.session_noise(session)[0],
-            ambient=ambient,
-            ambient_shots=0 if ambient is None or family.signed else ambient_shots(family),
-        )
+        noise = noise_of(self.bench, family, exposure_s, self.session_noise(session)[0], ambient)
         return Predictor(self.camera, shown, scene, noise)
+
+
+def noise_of(
+    bench: Apparatus, family: PatternFamily, seconds: float, factors: tuple[float, float], ambient: FloatArray | None
+) -> Noise:
+    """Return the noise of a ``bench`` under a ``family``; ``factors`` and ``ambient`` as of :class:`Noise`."""
+    dark, digital = bench.sensor.superpixel_dark_current_e_per_s, digital_of(bench.sensor, seconds)
+    return Noise(
+        seconds=seconds,
+        dark=dark,
+        read=float(digital.variance(0.0)) * seconds**2 - dark * seconds,
+        uneven=response_variance(bench.sensor) + bench.speckle(family) ** 2,
+        factors=factors,
+        ambient=ambient,
+        ambient_shots=0 if ambient is None or family.signed else ambient_shots(family),
+    )
 
 
 def _of_kind(side: Any, factor: FloatArray, kind: FloatArray) -> tuple[Any, FloatArray]:

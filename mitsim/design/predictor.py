@@ -91,19 +91,20 @@ class Camera:
     def brightest(self, scene: Scene, patterns: Pair, ambient: FloatArray | float = 0.0) -> float:
         """Return the light of the brightest pixel of all shots [electrons / s]."""
         pixels, signed = (1 + scene.beyond) * scene.pixels(self.cells), any((side < 0).any() for side in patterns)
-
-        def frame(rows: FloatArray, columns: FloatArray) -> FloatArray:
-            lit = np.flatnonzero(rows), np.flatnonzero(columns)
-            seen = pixels[np.ix_(*lit)] * np.outer(rows[lit[0]], columns[lit[1]])
-            return sum((a[:, lit[0]] @ seen @ b[:, lit[1]].T for a, b in self.pixel_terms), np.zeros((1, 1)))
-
-        dark = frame(*(np.ones(len(side)) for side in patterns))
+        dark = seen_frame(self.pixel_terms, pixels)
         leaking, most = self.leak * dark + ambient, 0.0
         for rows, columns in product(patterns[0].T.astype(np.float64), patterns[1].T.astype(np.float64)):
-            shown = frame(rows, columns)
+            shown = seen_frame(self.pixel_terms, pixels * np.outer(rows, columns))
             shots = ((dark + shown) / 2, (dark - shown) / 2) if signed else (shown,)
             most = max(most, *(float((shot + leaking).max()) for shot in shots))
         return most
+
+
+def seen_frame(terms: Sequence[SeparableTerm], light: FloatArray) -> FloatArray:
+    """Return the frame (m, m') of the ``light`` of scene pixels (n, n') through ``terms``."""
+    rows, columns = np.flatnonzero(light.any(axis=1)), np.flatnonzero(light.any(axis=0))
+    lit = light[np.ix_(rows, columns)]
+    return sum((left[:, rows] @ lit @ right[:, columns].T for left, right in terms), np.zeros((1, 1)))
 
 
 @dataclass(frozen=True)
@@ -212,19 +213,15 @@ class Predictor:
 
             def risk(lam: float) -> float:
                 errors = np.square(lam / (np.square(sigma) + lam)) * moments[0, 0] if lam else np.zeros_like(sigma)
-                return float(np.vdot(weights, errors + np.square(self._gain(lam)) * noise))
+                return float(np.vdot(weights, errors + np.square(self.prepared.gain(lam)) * noise))
 
             return max(best_lambda(risk, scale), least)
 
         every = best(last=3)
         return (every if self.seen is None else best(last=2)), every
 
-    def _gain(self, lam: float) -> FloatArray:
-        sigma = self.prepared.sigma
-        return np.divide(sigma, np.square(sigma) + lam, out=np.zeros_like(sigma), where=sigma > 0)
-
     def _by_coefficient(self, lam: float) -> dict[str, FloatArray]:
-        sigma, gain = self.prepared.sigma, self._gain(lam)
+        sigma, gain = self.prepared.sigma, self.prepared.gain(lam)
         kept, zero, square = gain * sigma, np.zeros_like(sigma), np.square(gain)
         found = {name: square * variance for name, variance in self._variances.items()}
         # By cause the weights of pixels, fine, full, seen and black, whose sum is the error of the whole.

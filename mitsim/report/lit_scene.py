@@ -260,11 +260,11 @@ class IdealCamera:
         best = best_term(centre_terms(self.terms) if self.centre else self.terms)
         return best.left, best.right
 
-    def calibrated(self, board_flux: float) -> Pair:
-        """Return the factors in a calibration's unit [sqrt(electrons / s)]."""
+    def calibrated(self, board_flux: float, term: Pair | None = None) -> Pair:
+        """Return the factors, or another ``term``, in a calibration's unit [sqrt(electrons / s)]."""
         model = self.bench.projector
         rate = electrons_from_irradiance(board_flux, 1.0, self.bench.sensor, model.effective_wavelength_nm)
-        left, right = self.factors
+        left, right = self.factors if term is None else term
         return left * np.sqrt(rate), right * np.sqrt(rate)
 
     def frames(self, family: PatternFamily, flux: FloatArray, plane: Plane | None = None) -> ExpectedFrames:
