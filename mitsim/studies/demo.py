@@ -141,7 +141,7 @@ def _run(bench: Bench, folder: Path, request: Request, names: list[str], job: Jo
         results = results_of(images, light.truth)
         figures = {"scene.png": _scene(lit, shots, main), **STUDY.draw(results)}
         section = replace(
-            section_of(STUDY, STUDY.name, (), figures, results),
+            section_of(STUDY, (), figures, results),
             message=headline(best, warnings),
             detail=f"{detail} {scene_line(bench.loaded.path)} The frames before noise are good to "
             f"{scientific(shots.manifest.total_error)}; {plan.accuracy:g} was asked for.",
