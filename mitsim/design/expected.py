@@ -104,11 +104,8 @@ def expected_error(
 
     turned = [(times(a, left), times(b, right)) for a, b in (cause.matrices for cause in causes)]
     seen = [((left * a).sum(axis=-2).ravel(), (right * b).sum(axis=-2).ravel()) for a, b in turned]
-    powers = [cause.powers for cause in causes]
-    of_rows, of_columns = (
-        np.stack([each[k] * values ** power[k] for each, power in zip(seen, powers, strict=True)])
-        for k, values in enumerate((rows, columns))
-    )
+    of_rows = np.stack([own * rows ** cause.powers[0] for (own, _), cause in zip(seen, causes, strict=True)])
+    of_columns = np.stack([own * columns ** cause.powers[1] for (_, own), cause in zip(seen, causes, strict=True)])
 
     coefficients = [turned_by(right, turned_by(left, scene).T).T for scene in scenes]
     energy = sum(np.square(each) for each in coefficients) / len(scenes)
@@ -135,26 +132,18 @@ def expected_error(
     inverse, matrices = np.square(once), []
     of_left, of_right = np.zeros_like(grams[0]), np.zeros_like(grams[1])
     for each in coefficients:
-        by_left = _blocks(each * once * columns, each * inverse, left)
-        by_right = _blocks((each * once * rows[:, None]).T, (each * inverse).T, right)
-        of_left -= lam**2 / len(scenes) * (by_left + by_left.mT)
-        of_right -= lam**2 / len(scenes) * (by_right + by_right.mT)
+        halves = (each * once * columns, each * inverse), ((each * once * rows[:, None]).T, (each * inverse).T)
+        for of, half, basis in zip((of_left, of_right), halves, (left, right), strict=True):
+            first, second = (matrix.reshape(*basis.shape[:-1], -1) for matrix in half)
+            of -= lam**2 / len(scenes) * (first @ second.mT + second @ first.mT)
     for cause, (a, b), own, other in zip(causes, turned, of_rows, of_columns, strict=True):
         (i, j), weight = cause.powers, cause.weight
         of_left += weight * (left.mT @ a) * _divided(mu, columns, lam, i, other)
         of_right += weight * (right.mT @ b) * _divided(nu, rows, lam, j, own)
-        gains = weight * rows**i * (inverse @ other), weight * columns**j * (own @ inverse)
-        by_left, by_right = (
-            gain.reshape(values.shape)[..., None, :] for gain, values in zip(gains, (mu, nu), strict=True)
-        )
+        by_left = weight * (rows**i * (inverse @ other)).reshape(mu.shape)[..., None, :]
+        by_right = weight * (columns**j * (own @ inverse)).reshape(nu.shape)[..., None, :]
         matrices.append(((left * by_left) @ left.mT, (right * by_right) @ right.mT))
     return ExpectedError(lam, parts, found, (left @ of_left @ left.mT, right @ of_right @ right.mT), tuple(matrices))
-
-
-def _blocks(first: FloatArray, second: FloatArray, basis: FloatArray) -> FloatArray:
-    """Return the blocks of a product (n, n'), (n, n')^T that a basis has."""
-    shape = *basis.shape[:-1], -1
-    return np.asarray(first.reshape(shape) @ second.reshape(shape).mT)
 
 
 def _divided(mu: FloatArray, nu: FloatArray, lam: float, power: int, weights: FloatArray) -> FloatArray:

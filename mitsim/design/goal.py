@@ -99,10 +99,8 @@ class Goal(Options):
 
     def check_count(self) -> None:
         """Raise MitsimError for too many combinations."""
-        pictures = len(self.shown)
-        for names in (("feature_um", "mask_distance_mm", "patterns"), ("doses", "scene_distances_mm", "pictures")):
-            counts = [pictures if name == "pictures" else len(getattr(self, name)) for name in names]
-            if (count := math.prod(max(each, 1) for each in counts)) > _MOST:
+        for names in (("feature_um", "mask_distance_mm", "patterns"), ("doses", "scene_distances_mm")):
+            if (count := math.prod(max(len(getattr(self, name)), 1) for name in names)) > _MOST:
                 raise MitsimError(f"goal: {', '.join(names)}: got {count} combinations; give at most {_MOST}")
 
 
@@ -115,10 +113,8 @@ def load_goal(path: Path | str) -> Goal:
         raise refuse_together(f"file {path}", [*texts]) from error
     patterns = (os.path.normpath(base / each) if is_own(each, base) else each for each in goal.patterns)
     update: dict[str, object] = {"patterns": tuple(patterns)}
-    for name in ("scene", "camera"):
+    for name in ("scene", "camera", "pictures"):
         text = str(getattr(goal, name))
-        if os.sep in text or Path(text).suffix:
+        if os.sep in text or Path(text).suffix or (name == "pictures" and goal.pictures):
             update[name] = os.path.normpath(base / text)
-    if goal.pictures is not None:
-        update["pictures"] = os.path.normpath(base / goal.pictures)
     return goal.model_copy(update=update)

@@ -95,7 +95,8 @@ class Candidate:
 
     def payload(self) -> dict[str, Any]:
         return {
-            "name": self.name,
+            **{name: getattr(self, name) for name in ("name", "cases", "causes", "warnings")},
+            **{f"psnr_{name}": getattr(self, name) for name in ("predicted", "rendered", "scatter")},
             "feature_um": self.choice.feature_mm * 1e3,
             "mask_distance_mm": self.choice.distance_mm,
             "patterns": self.choice.shown,
@@ -103,14 +104,8 @@ class Candidate:
             "code": _text(self.found.code),
             "evaluations": self.found.evaluations,
             "exposure_total_s": self.exposures[0],
-            "cases": self.cases,
             "psnr_of_search": self.found.psnr_db,
-            "psnr_predicted": self.predicted,
-            "causes": self.causes,
-            "psnr_rendered": self.rendered,
-            "psnr_scatter": self.scatter,
             "session_exposure_s": self.session_s,
-            "warnings": self.warnings,
         }
 
 
@@ -139,13 +134,11 @@ def stand_of(bench: Apparatus, seed: int) -> Stand:
 def objectives(stand: Stand, goal: Goal, choice: Choice) -> list[Objective]:
     """Return the objectives of a ``choice``, one for each dose and distance."""
     bench, sensor = stand.bench, stand.bench.sensor
-    family, pictures = choice.family(bench), PredictRequest(pictures=goal.pictures)
-    scenes = [each.pixels(CELLS) for _, each in scenes_of(pictures, stand)]
+    family = choice.family(bench)
+    scenes = [each.pixels(CELLS) for _, each in scenes_of(PredictRequest(pictures=goal.pictures), stand)]
+    judged = [[each] for each in scenes] if goal.judge == "worst" else [scenes]
     if goal.prior is not None:
-        prior = Prior(*goal.prior)
-        judged = [(prior, prior.draw(stand.truth.shape, goal.seed))]
-    else:
-        judged = [(prior_of(each), each) for each in ([[one] for one in scenes] if goal.judge == "worst" else [scenes])]
+        judged = [Prior(*goal.prior).draw(stand.truth.shape, goal.seed)]
     if family.signed:
         problem = f"patterns: got {choice.patterns!r}, which are differences of two frames, and a search knows single"
         raise MitsimError(f"goal: {problem} ones; give uniform, dots:K, random:K or own patterns")
@@ -180,30 +173,28 @@ def objectives(stand: Stand, goal: Goal, choice: Choice) -> list[Objective]:
                 most_e=_FULL * sensor.superpixel_full_well_e,
                 ambient_shots=shots,
             )
-            found += [Objective((rows, columns), light, *each) for each in judged]
+            found += [Objective((rows, columns), light, prior_of(each, goal), each) for each in judged]
     if goal.exposures == "light":
         code = Search(found).maximum_length().code
         found = [each.of_equal_light((code, code)) for each in found]
     return found
 
 
-def _lamps(stand: Stand) -> tuple[list[tuple[Directions, FloatArray]], ...]:
+def _lamps(stand: Stand) -> list[list[tuple[Directions, FloatArray]]]:
     """Return the directions of ambient light along both axes, with margins that are relative to a white pixel."""
-    found = tuple(list[tuple[Directions, FloatArray]]() for _ in range(2))
-    estimate, simulation = stand.scene.estimate, stand.scene.simulation
-    if stand.ambient is not None:
-        every = {name: light[[stand.bench.n**2]].toarray().ravel() for name, light in estimate.light.items()}
-        scale = (sum(light.sum() for light in every.values()) * stand.board.pixels.mean()) ** -0.5
-        for name, light in every.items():
-            bundle = simulation.grids[name].bundle
-            if light.any():
-                for axis, each in enumerate(found):
-                    each.append((bundle.directions[axis], scale * light.reshape(bundle.cells).sum(axis=1 - axis)))
-    return found
+    grids, every, last = stand.scene.simulation.grids, stand.scene.estimate.light.items(), [stand.bench.n**2]
+    lit = [(grids[name].bundle, light[last].toarray()) for name, light in every if stand.ambient is not None]
+    scale = (sum(light.sum() for _, light in lit) * stand.board.pixels.mean()) ** -0.5 if lit else 0.0
+    margins = [[light.reshape(each.cells).sum(axis=1 - k) * scale for each, light in lit] for k in (0, 1)]
+    return [
+        [(each.directions[k], at) for (each, _), at in zip(lit, margins[k], strict=True) if at.any()] for k in (0, 1)
+    ]
 
 
-def prior_of(scenes: Sequence[FloatArray]) -> Prior:
-    """Return mean, deviation and correlation of the apparent reflectance of scenes."""
+def prior_of(scenes: Sequence[FloatArray], goal: Goal) -> Prior:
+    """Return the goal's prior, or mean, deviation and correlation of the apparent reflectance of scenes."""
+    if goal.prior is not None:
+        return Prior(*goal.prior)
     mean = float(np.mean(scenes))
     off = np.stack(scenes) - mean
     variance = float(np.square(off).mean())
@@ -295,10 +286,9 @@ def run_search(goal: Goal, folder: Path, job: Job, every: dict[Choice, Search]) 
     for name, (choice, found, search) in best.items():
         each = len(search.objectives) // max(len(goal.scene_distances_mm), 1) // len(goal.doses)  # pictures
         longer = [one.frame_s((found.code, found.code)) / one.light.frame_s for one in search.objectives]
-        exposures = (
-            goal.exposure_total_s * dose * min(longer[k * each : (k + 1) * each]) for k, dose in enumerate(goal.doses)
-        )
-        candidates.append(Candidate(name, choice, found, tuple(exposures)))
+        parts = (min(longer[k * each : (k + 1) * each]) for k in range(len(goal.doses)))
+        exposures = tuple(goal.exposure_total_s * dose * part for dose, part in zip(goal.doses, parts, strict=True))
+        candidates.append(Candidate(name, choice, found, exposures))
     return candidates, complete
 
 
@@ -345,30 +335,16 @@ def sensitivity(search: Search, code: FloatArray) -> dict[str, float]:
     here, random = search.score(code).score, stream(search.seed, "flaws")
     worse = []
     for _ in range(8):
-        made = code.copy()
         places = random.choice(search.used, max(round(len(search.used) / 100), 1), replace=False)
-        made[places] = 1 - made[places]
-        worse.append(search.score(made).score)
+        worse.append(search.score(np.abs(code - np.isin(np.arange(len(code)), places))).score)
     flaws, dark = float(np.mean(worse)) / here, _score(search, code, 0.1) / here
     losses = {"one feature in a hundred wrong": flaws, "a tenth of the light": dark}
     return {name: -10 * math.log10(loss) for name, loss in losses.items()}
 
 
-def by_distance(search: Search, code: FloatArray, goal: Goal) -> dict[str, float]:
-    """Return the expected PSNR [dB] at each distance of the goal, as it is judged over doses and pictures."""
-    count, found = len(goal.scene_distances_mm), dict[str, float]()
-    for number, distance in enumerate(goal.scene_distances_mm):
-        part = len(search.objectives) // count
-        own = replace(search, objectives=search.objectives[number * part : (number + 1) * part])
-        found[f"at {distance:g} mm"] = -10 * math.log10(own.score(code).score)
-    return found
-
-
 def _score(search: Search, code: FloatArray, longer: float) -> float:
     """Return the score of a code for exposures that are ``longer`` by a factor."""
-    changed = [
-        replace(each, light=replace(each.light, frame_s=each.light.frame_s * longer)) for each in search.objectives
-    ]
+    changed = [replace(one, light=replace(one.light, frame_s=one.light.frame_s * longer)) for one in search.objectives]
     return Search(changed, search.open_part, search.worst, search.seed).score(code).score
 
 

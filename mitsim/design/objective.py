@@ -23,7 +23,6 @@ from functools import cached_property
 import numpy as np
 from scipy.fft import fft, ifft, next_fast_len
 from scipy.sparse import csr_array, eye_array, kron
-from scipy.sparse.csgraph import connected_components
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
@@ -76,7 +75,7 @@ class Light:
     ``frame_s`` is the exposure time of one frame, and ``session_e`` are electrons of the brightest pixel of a session.
     With ``signal_e``, the mean electrons of a pixel and frame, exposures are of equal light instead: a mask that
     transmits less is exposed for longer. No pixel gets more than ``most_e``: a mask that transmits more is exposed for
-    a shorter time. ``ambient_shots`` are those of the ambient frame that is subtracted from all frames, 0 for none.
+    a shorter time. ``ambient_shots`` are those of the ambient frame that is subtracted from all frames. 0 is none.
     """
 
     gain: float
@@ -84,7 +83,7 @@ class Light:
     session_e: float
     read_noise_e: float
     dark_e_per_s: float
-    signal_e: float | None = None
+    signal_e: float = 0.0
     most_e: float = math.inf
     ambient_shots: float = 0.0
 
@@ -150,21 +149,19 @@ class CodedSide:
         self.used = np.flatnonzero(np.abs(middles) < reach + feature / 2)
 
     def _show(self, patterns: FloatArray) -> None:
-        """Group projector pixels so that no pattern lights pixels of two groups, which makes M block diagonal.
+        """Group projector pixels by patterns if each has its own, which makes M block diagonal.
 
         ``pixels`` (groups, size) are filled up with others that are not ``real``, and ``lit`` are the patterns of each
         group, (groups, size, patterns).
         """
         self.patterns = patterns
-        label = connected_components(csr_array(patterns @ patterns.T))[1]
-        groups = [np.flatnonzero(label == each) for each in range(label.max() + 1)]
-        shown = [np.flatnonzero(patterns[each].any(axis=0)) for each in groups]
-        if len({*map(len, shown)}) > 1 or len(groups) * max(map(len, groups)) > 2 * len(label):
-            groups, shown = ([np.arange(count)] for count in patterns.shape)
+        one_each = bool((np.count_nonzero(patterns, axis=1) == 1).all())
+        groups = [np.flatnonzero(each) for each in (patterns.T if one_each else np.ones((1, len(patterns))))]
         size = max(map(len, groups))
-        self.pixels = np.array([np.resize(each, size) for each in groups])
+        self.pixels = np.array([np.resize(each, size) for each in groups], dtype=np.intp)
         self.real = np.arange(size) < np.array([[len(each)] for each in groups])
-        self.lit = patterns[self.pixels[:, :, None], np.array(shown)[:, None, :]] * self.real[:, :, None]
+        shown = np.arange(patterns.shape[1]).reshape(len(groups), 1, -1)
+        self.lit = patterns[self.pixels[:, :, None], shown] * self.real[:, :, None]
         self.gram = self.lit @ self.lit.mT
         self.squared, total = self.gram @ self.gram, self.lit.sum(axis=2)
         self.summed = total[:, :, None] * total[:, None, :]
@@ -200,8 +197,9 @@ class CodedSide:
             stack = own * pattern[..., None]
             shot += (stack * seen[:, None]) @ stack.mT
         gram, reused, summed = cross * self.gram, cross * self.squared, cross * self.summed
-        inside, dimmed = detail @ detail.mT, (own * ambient) @ own.mT * self.gram
-        return Factor(values, ambient, back, own, moved, bright, gram, detail, inside, reused, shot, dimmed, summed)
+        dimmed = (own * ambient) @ own.mT * self.gram
+        matrices = gram, shot, reused, detail @ detail.mT, dimmed, summed
+        return Factor(values, ambient, back, own, moved, bright, detail, matrices)
 
 
 @dataclass(frozen=True, eq=False)
@@ -218,13 +216,8 @@ class Factor:
     own: FloatArray
     moved: FloatArray
     bright: FloatArray
-    gram: FloatArray
     detail: FloatArray
-    inside: FloatArray
-    reused: FloatArray
-    shot: FloatArray
-    dimmed: FloatArray
-    summed: FloatArray
+    matrices: tuple[FloatArray, ...]
 
 
 def cyclic_patterns(lit: str, n: int) -> FloatArray:
@@ -267,15 +260,9 @@ class Objective:
     scenes: Sequence[FloatArray]
 
     @cached_property
-    def _matrices(self) -> list[tuple[FloatArray, FloatArray, FloatArray]]:
-        """Return the unit matrix, the scene's covariance and its second moment, for both sides."""
-        prior, found = self.prior, []
-        for side in self.sides:
-            covariance = prior.covariance(len(side.patterns))
-            second = prior.mean**2 + prior.deviation**2 * covariance
-            every = (side.grouped(each) for each in (np.eye(len(covariance)), covariance, second))
-            found.append((next(every), next(every), next(every)))
-        return found
+    def _covariances(self) -> tuple[FloatArray, FloatArray]:
+        rows, columns = (side.grouped(self.prior.covariance(len(side.patterns))) for side in self.sides)
+        return rows, columns
 
     @cached_property
     def _scenes(self) -> list[FloatArray]:
@@ -301,20 +288,17 @@ class Objective:
             peaks.append((side.patterns[:, pattern], next(at), next(at)))
 
         def exposed(electrons: float, reflectance: float, weights: list[_Weights]) -> tuple[float, list[_Weights]]:
-            pairs = [*zip(factors, weights, strict=True)]
-            lit, lamps = (
-                [float(a @ x.values @ b) for x, (a, b, _) in pairs],
-                [float(c @ x.ambient) for x, (*_, c) in pairs],
-            )
+            lit, lamps = list[float](), list[float]()
+            for factor, (a, b, c) in zip(factors, weights, strict=True):
+                lit.append(float(a @ factor.values @ b))
+                lamps.append(float(c @ factor.ambient))
             bright = reflectance * lit[0] * lit[1] + lamps[0] * lamps[1]
-            slopes = [
-                (a * -reflectance * y, b, c * -z)
-                for (a, b, c), y, z in zip(weights, lit[::-1], lamps[::-1], strict=True)
-            ]
-            return electrons / (light.gain * bright), [(a / bright, b, c / bright) for a, b, c in slopes]
+            each = zip(weights, lit[::-1], lamps[::-1], strict=True)
+            slopes = [(a * (-reflectance * x / bright), b, c * (-y / bright)) for (a, b, c), x, y in each]
+            return electrons / (light.gain * bright), slopes
 
         limit = exposed(light.most_e, prior.mean + _BRIGHT * prior.deviation, peaks)
-        asked = (light.frame_s, None) if light.signal_e is None else exposed(light.signal_e, prior.mean, means)
+        asked = exposed(light.signal_e, prior.mean, means) if light.signal_e else (light.frame_s, None)
         return limit if limit[0] < asked[0] else asked
 
     def of_equal_light(self, codes: Sequence[FloatArray]) -> Objective:
@@ -328,9 +312,9 @@ class Objective:
         sides = rows, (rows if self.sides[0] is self.sides[1] else self.sides[1].lit_by(lit))
         light = self.light
         for new, old in zip(sides, self.sides, strict=True):
-            if light.signal_e is not None:  # that of the mask by which light is equal
-                light = replace(light, signal_e=light.signal_e * new.patterns.mean() / old.patterns.mean())
-            light = replace(light, ambient_shots=light.ambient_shots * new.overlap / old.overlap)
+            brighter, more = new.patterns.mean() / old.patterns.mean(), new.overlap / old.overlap
+            # Equal light is that of one mask for all.
+            light = replace(light, signal_e=light.signal_e * brighter, ambient_shots=light.ambient_shots * more)
         return replace(self, sides=sides, light=light)
 
     def __call__(self, codes: Sequence[FloatArray], lam: float | None = None, slopes: bool = False) -> Value:
@@ -339,7 +323,9 @@ class Objective:
         alike = sides[0] is sides[1] and codes[0] is codes[1]
         stacks = first, (first if alike else sides[1](codes[1]))
         factors = [stack.values for stack in stacks]
-        (one, covariance, second), others = self._matrices
+        gram, shot, reused, inside, dimmed, summed = zip(*(each.matrices for each in stacks), strict=True)
+        covariances, one = self._covariances, [np.eye(side.pixels.shape[1]) for side in sides]
+        second = [prior.mean**2 + prior.deviation**2 * each for each in covariances]
         seconds, exposed = self._exposure(stacks)
         electrons = light.gain * seconds
         noise = light.read_noise_e**2 / electrons**2 + light.dark_e_per_s / light.gain / electrons
@@ -355,16 +341,16 @@ class Objective:
         errors = [(read + dark + full[k] * cubed[1 - k] / session) / len(factors[k]) / norms[1 - k] for k in (0, 1)]
         moment = prior.deviation**2 * (1 - prior.correlation) * _MOMENT
         causes = [
-            Cause("dark_and_read_noise", (1, 1), (one, others[0]), noise),
-            Cause("shot_noise", (0, 0), (stacks[0].shot, stacks[1].shot), prior.mean / electrons),
-            Cause("calibration_noise", (0, 2), (stacks[0].reused, others[2]), errors[0]),
-            Cause("calibration_noise", (2, 0), (second, stacks[1].reused), errors[1]),
-            Cause("print_detail", (0, 2), (stacks[0].inside, others[1]), moment),
-            Cause("print_detail", (2, 0), (covariance, stacks[1].inside), moment),
-            Cause("ambient_light", (0, 0), (stacks[0].dimmed, stacks[1].dimmed), 1 / electrons),
-            Cause("ambient_light", (0, 0), (stacks[0].summed, stacks[1].summed), (noise + ambient) * once),
+            Cause("dark_and_read_noise", (1, 1), (one[0], one[1]), noise),
+            Cause("shot_noise", (0, 0), shot, prior.mean / electrons),
+            Cause("calibration_noise", (0, 2), (reused[0], second[1]), errors[0]),
+            Cause("calibration_noise", (2, 0), (second[0], reused[1]), errors[1]),
+            Cause("print_detail", (0, 2), (inside[0], covariances[1]), moment),
+            Cause("print_detail", (2, 0), (covariances[0], inside[1]), moment),
+            Cause("ambient_light", (0, 0), dimmed, 1 / electrons),
+            Cause("ambient_light", (0, 0), summed, (noise + ambient) * once),
         ]
-        found = expected_error((stacks[0].gram, stacks[1].gram), causes, self._scenes, lam, slopes)
+        found = expected_error(gram, causes, self._scenes, lam, slopes)
         pixels = len(factors[0]) * len(factors[1])
         value = Value({name: part / pixels for name, part in found.parts.items()}, found.lam)
         if not slopes:

@@ -21,7 +21,6 @@ from mitsim.design.goal import Goal
 from mitsim.design.masks import (
     PATTERNS,
     Candidate,
-    by_distance,
     run_search,
     searches,
     seconds_for,
@@ -81,10 +80,7 @@ class Design:
                 rows.append((*shown, f"{case['psnr_rendered']:.2f}", "", "", f"{case['exposure_total_s']:.3g}", "", ""))
         notes = ["Scatter is that of single captures; open part is that of the features of a side."]
         notes += [f"Camera file, drawings and patterns that were found: {self.output}/design/, and so on."]
-        notes += [
-            f"The search expects {level:.2f} dB {place}, which is not rendered."
-            for place, level in self.distances.items()
-        ]
+        notes += [f"Not rendered, expected at {place}: {level:.2f} dB." for place, level in self.distances.items()]
         notes += [f"Expected change by {name}: {change:+.1f} dB." for name, change in self.sensitivity.items()]
         notes += [f"The design has reached a bound: {name}." for name in self.bounds]
         if self.seconds_for_psnr is not None:
@@ -118,7 +114,7 @@ def prove(goal: Goal, candidate: Candidate, camera: Path, job: Job, bench: Bench
 
     patterns = str(camera.parent / PATTERNS) if candidate.choice.lit else candidate.choice.patterns
     cases, levels, predictions, warnings = [], [], [], list[str]()
-    factors, image = None, candidate.image
+    factors = None
     for shown in goal.shown:
         own = bench or open_bench(goal.scene, camera=str(camera), **shown)
         factors = factors or own.calibrate(accuracy=goal.accuracy, seed=goal.seed, job=job)
@@ -133,7 +129,6 @@ def prove(goal: Goal, candidate: Candidate, camera: Path, job: Job, bench: Bench
                 assert truth is not None
                 found.append(psnr(solved.image, truth))
                 warnings += map(str, solved.status.flags)
-                image = solved.image
             case = {name: each.name for name, each in shown.items()} | {"dose": dose, "exposure_total_s": seconds}
             cases.append(case | {"psnr_predicted": predicted.psnr_db, "psnr_rendered": float(np.mean(found))})
             predictions.append(predicted)
@@ -149,7 +144,7 @@ def prove(goal: Goal, candidate: Candidate, camera: Path, job: Job, bench: Bench
         scatter=float(rendered.std(ddof=1)),
         session_s=worst.session_exposure_s,
         warnings=tuple(dict.fromkeys(warnings)),
-        image=image,
+        image=solved.image,
     )
 
 
@@ -187,7 +182,8 @@ def design(
             with job.clock.stage("proof"):
                 proved.append(prove(asked, each, file, job.apart(f"{each.name} ")))
         best, *simple = proved
-        own = every[best.choice]
+        own, code, distances = every[best.choice], best.found.code, asked.scene_distances_mm
+        first = own.objectives[:: len(own.objectives) // len(distances)] if distances else ()
         texts = dict.fromkeys(text for each in proved for text in each.warnings)
         warnings = [f"{', '.join(each.name for each in proved if text in each.warnings)}: {text}" for text in texts]
         if best.rendered < best.predicted - _SHORT_DB:
@@ -200,10 +196,10 @@ def design(
             warnings.append(f"The design is no better than a simple mask: {known}; take it, or use more seeds")
         found = Design(
             candidates=tuple(proved),
-            bounds=tuple(own.active_bounds(best.found.code)),
-            distances=by_distance(own, best.found.code, asked),
-            sensitivity=sensitivity(own, best.found.code),
-            seconds_for_psnr=None if asked.wanted_psnr_db is None else seconds_for(own, best.found.code, asked),
+            bounds=tuple(own.active_bounds(code)),
+            distances={f"{mm:g} mm": one((code, code)).psnr_db for mm, one in zip(distances, first, strict=True)},
+            sensitivity=sensitivity(own, code),
+            seconds_for_psnr=None if asked.wanted_psnr_db is None else seconds_for(own, code, asked),
             complete=complete,
             seconds=job.clock.seconds(),
             output=str(folder),

@@ -88,8 +88,8 @@ def test_a_search_beats_simple_masks_and_repeats_bit_by_bit(objective: Objective
     assert best.score < search.best_random(spent).score
     pinholes_ = search.best_pinholes()
     assert pinholes_ is not None and best.score <= pinholes_.score
-    done = search.improve("here", found[0].code, evaluations=3000)
-    assert done.evaluations < 3000 and done.score <= found[0].score
+    done = search.improve("here", CODE, evaluations=3000)
+    assert done.evaluations < 150  # 97; flips in the wrong order take 193
     for place in search.used:
         other = done.code.copy()
         other[place] = 1 - other[place]
@@ -121,19 +121,23 @@ def test_the_worst_of_two_exposures_counts(objective: Objective) -> None:
     assert 0.9 * max(alone) < worst <= max(alone)
 
 
-@pytest.mark.parametrize(("read_noise_e", "lit_pixels"), [(3.0, 1), (300.0, 2)])
-def test_the_best_cyclic_patterns_are_those_of_all_codes(
-    objective: Objective, read_noise_e: float, lit_pixels: int
-) -> None:
-    """Each of 31 codes of period 5 with patterns of its own; mirror images, which are not tried, differ by 1e-3."""
+@pytest.mark.parametrize(("read_noise_e", "lit_pixels"), [(3.0, 2), (300.0, 3)])
+def test_the_best_cyclic_patterns_are_those_of_all_codes(read_noise_e: float, lit_pixels: int) -> None:
+    """Each of 31 codes of period 5 with patterns of its own; mirror images, which are not tried, differ by 1e-3.
+
+    Behind lamps, whose frame has more shots for patterns that overlap, as in a capture.
+    """
     light, patterns = replace(LIGHT, read_noise_e=read_noise_e), list[FloatArray]()
     for number in range(1, 32):
         bits = np.array([number >> place & 1 for place in range(5)], dtype=np.float64)
         patterns.append(np.stack([np.roll(np.tile(bits, 4), shift)[:N] for shift in range(5)], axis=1))
-    every = [
-        Objective((one, one), light, Prior(), SCENES)((CODE, CODE)).total for one in (side(LINES, c) for c in patterns)
-    ]
-    search = Search([replace(objective, light=light)])
+    every = []
+    for each in patterns:
+        alike = float(np.square(each.sum(axis=1)).sum() / np.square(each).sum()) ** 2
+        one = side(LINES, each, lit=True)
+        every.append(Objective((one, one), replace(light, ambient_shots=alike), Prior(), SCENES)((CODE, CODE)).total)
+    one = side(LINES, lit=True)
+    search = Search([Objective((one, one), replace(light, ambient_shots=1.0), Prior(), SCENES)])
     lit = search.best_patterns(CODE, 5)
     found = search.lit_by(lit).score(CODE).score
     assert found < (1 + 1e-3) * min(every) and found <= search.lit_by("10000").score(CODE).score
