@@ -483,7 +483,7 @@ SIZES = {
     "calibrate": (5, 1154),
     "cli": (6, 1538),
     "core": (17, 3085),
-    "design": (8, 1466),
+    "design": (8, 1412),
     "devices": (9, 2209),
     "exchange": (5, 1299),
     "learn": (5, 1190),
@@ -495,7 +495,7 @@ SIZES = {
     "scene": (5, 1349),
     "sensor": (4, 1105),
     "sessions": (4, 903),
-    "studies": (24, 5031),
+    "studies": (24, 5027),
     "top level": (5, 525),
     "transport": (15, 3948),
 }
