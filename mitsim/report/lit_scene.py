@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import html
 import io
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
 from pathlib import Path
@@ -122,7 +122,7 @@ class Unexposed:
     """Frames of a scene before any exposure, and the factors that solve them.
 
     ``centre`` is True where means are subtracted from frames; ``plane`` is that of an idealised scene, None for that of
-    the factors.
+    the factors; ``bench`` may have another mask.
     """
 
     lit: LitScene
@@ -132,10 +132,11 @@ class Unexposed:
     centre: bool
     seed: int
     plane: Plane | None = None
+    bench: Apparatus | None = None
 
     @cached_property
     def expected(self) -> ExpectedFrames:
-        return self.lit.expected_frames(self.model, self.family, self.plane)
+        return self.lit.expected_frames(self.model, self.family, self.plane, self.bench)
 
     def seconds(self, exposure: str) -> float:
         if exposure in (EQUAL_PEAK, DIM):
@@ -215,12 +216,20 @@ def accumulate(
 ) -> list[Accumulator]:
     sums = [model.accumulator() for model in models]
     with single_threaded_blas():
-        ambient = taken_off(exposer, family, expected)
-        for measurement, row, column in exposer.measurements(family, expected):
-            frame = bin_frame(measurement - ambient, binning)
+        for measurement, row, column in measured(exposer, family, expected):
+            frame = bin_frame(measurement, binning)
             for each in sums:
                 each.add(frame, row, column)
     return sums
+
+
+def measured(
+    exposer: Exposer, family: PatternFamily, expected: ExpectedFrames
+) -> Iterator[tuple[FloatArray, int, int]]:
+    """Yield noisy measurements without ambient light [electrons/s], and their patterns."""
+    ambient = taken_off(exposer, family, expected)
+    for measurement, row, column in exposer.measurements(family, expected):
+        yield measurement - ambient, row, column
 
 
 # -------- The paper's idealised camera
