@@ -491,11 +491,11 @@ SIZES = {
     "optics": (7, 1751),
     "planner": (6, 1627),
     "reconstruct": (16, 5498),
-    "report": (6, 1797),
+    "report": (6, 1803),
     "scene": (5, 1349),
     "sensor": (4, 1105),
     "sessions": (4, 903),
-    "studies": (24, 5027),
+    "studies": (24, 5011),
     "top level": (5, 525),
     "transport": (15, 3948),
 }
