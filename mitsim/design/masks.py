@@ -18,8 +18,8 @@ from scipy.optimize import brentq
 
 from mitsim.acquire.exposure import ambient_shots
 from mitsim.bench.apparatus import Apparatus
-from mitsim.bench.layout import before_board
 from mitsim.bench.request import PredictRequest
+from mitsim.calibrate.board_session import Session
 from mitsim.core.arrays import FloatArray
 from mitsim.core.configuration import Configuration, validate
 from mitsim.core.errors import MitsimError
@@ -30,7 +30,7 @@ from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.seeds import stream
 from mitsim.design.goal import Goal
 from mitsim.design.objective import CodedSide, Light, Objective, Prior, cyclic_patterns
-from mitsim.design.predict import CELLS, Stand, TracedLight, scenes_of
+from mitsim.design.predict import CELLS, Stand, scenes_of
 from mitsim.design.search import Found, Search
 from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.patterns import PatternFamily, short_name
@@ -121,9 +121,8 @@ def _camera(bench: Apparatus, **update: Any) -> CameraGeometry:
 def stand_of(bench: Apparatus, seed: int) -> Stand:
     """Trace the light of a scene and of its white board; the bench, of any mask, gets a thin separable one."""
     bench.loaded.camera.wear(_camera(bench))
-    bench, recipe = replace(bench, devices=replace(bench.devices, camera=_camera(bench))), load_recipe()
-    board = TracedLight.of(before_board(bench, recipe.board_reflectance), seed)
-    stand = Stand(bench, TracedLight.of(bench, seed), board)
+    bench = replace(bench, devices=replace(bench.devices, camera=_camera(bench)))
+    stand = Stand.of(Session(bench, load_recipe(), seed))
     if not (stand.unit > 0 and stand.truth.any()):
         problem = f"scene {bench.loaded.path}: no light of the projector comes from it to the camera"
         raise MitsimError(f"{problem}, so that no mask is better than another; give another scene")

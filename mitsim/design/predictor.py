@@ -21,6 +21,7 @@ S[k, l] A_R[b, l] B_R[b, l]. Each cause has half of its cross terms with others,
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
@@ -149,6 +150,11 @@ class Errors:
     def psnr_db(self) -> float:
         return decibels(self.total)
 
+    @property
+    def largest(self) -> str:
+        """Return the largest cause in words."""
+        return max(self.causes, key=lambda name: self.causes[name]).replace("_", " ")
+
 
 def decibels(square: float) -> float:
     """Return a mean squared error of reflectance as PSNR [dB], infinite for none."""
@@ -174,6 +180,15 @@ class Predictor:
         # Both shots of a signed pattern light every pixel once.
         self._lighting = [np.ones_like(side) if self.signed else side for side in self.patterns]
 
+    def calibrated(self, factors: tuple[float, float]) -> Predictor:
+        """Return the predictor with other deviations of the factors; what does not depend on them is shared."""
+        _ = self._moments  # shared from now on
+        other = copy(self)
+        other.noise = replace(self.noise, factors=factors)
+        for name in ("lambdas", "_variances"):
+            vars(other).pop(name, None)
+        return other
+
     def errors(self, lam: float | None = None) -> Errors:
         """Return the errors at ``lam``; None for the lambda that the solver chooses by itself."""
         lam = self.automatic if lam is None else lam
@@ -181,6 +196,24 @@ class Predictor:
         # Nothing shows the part of the scene beyond the basis.
         causes[REGULARISATION] += max(self._energy - float(self._moments[0, 0].sum()), 0.0) / self.prepared.unknowns
         return Errors(causes, lam)
+
+    def session_scatter(self, lam: float) -> float:
+        """Return the standard deviation of the squared error between sessions, relative to its mean.
+
+        A session adds normal errors x of covariance C to the errors e of other causes, whose signs are taken as random.
+        The sum of squares of e + x then has the variance 2 tr C^2 + 4 sum_i C_ii e_i^2 (Searle, Linear Models, 1971,
+        section 2.5). Noise of a factor is correlated only between coefficients of one row, or of one column.
+        """
+        square, variance, errors = np.square(self._gain(lam)), 0.0, self._by_coefficient(lam)
+        for axis, weights in enumerate((square, square.T)):
+            variances, data = self._factor_data(axis)
+            light = self._mean_of(data) if axis == 0 else self._mean_of(data).T
+            for own, weight in zip(variances, weights, strict=True):
+                variance += 2 * float(own @ np.square((light * weight) @ light.T) @ own)
+        both = np.square(square) * self._of_factor(0) * self._of_factor(1).T
+        others = np.sum([each for name, each in errors.items() if name != SESSION], axis=0)
+        variance += 4 * float(np.sum(both + errors[SESSION] * others))
+        return float(np.sqrt(variance)) / self.prepared.unknowns / self.errors(lam).total
 
     @property
     def automatic(self) -> float:
@@ -322,12 +355,16 @@ class Predictor:
 
     def _of_factor(self, axis: int) -> FloatArray:
         """Return the variance (r, r') of W by independent noise of a factor, sum_p rho[a, p] (X V S)[p, b]^2."""
+        variances, data = self._factor_data(axis)
+        seen = self._expected(data, data)
+        return variances @ (seen if axis == 0 else seen.T)
+
+    def _factor_data(self, axis: int) -> tuple[FloatArray, Sequence[Pair]]:
+        """Return the variances s^2 rho (r, n) of a factor's noise, and the operator of its light X V S (n, r')."""
         own, other = self._sides[axis], self._sides[1 - axis]
         responses, of_kind = kind_responses(own, self.patterns[axis])
         through = self._in_cells(np.eye(own.scene_size)), self._in_cells(other.response.T)
-        data = [through if axis == 0 else through[::-1]]
-        seen = self._expected(data, data)
-        return self.noise.factors[axis] ** 2 * responses @ of_kind @ (seen if axis == 0 else seen.T)
+        return self.noise.factors[axis] ** 2 * responses @ of_kind, [through if axis == 0 else through[::-1]]
 
     @property
     def _energy(self) -> float:

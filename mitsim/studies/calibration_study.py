@@ -22,9 +22,8 @@ import numpy as np
 
 from mitsim.acquire.exposure import ambient_shots, takes_ambient_frame
 from mitsim.bench.request import Exposure
-from mitsim.calibrate.board_session import LitSession, Session, manifest_of
+from mitsim.calibrate.board_session import LitSession, Session, entry_variances, manifest_of
 from mitsim.calibrate.calibrate import NOISE_FREE, NOISY, estimates
-from mitsim.calibrate.session_plan import vector_variance
 from mitsim.core.arrays import FloatArray
 from mitsim.core.job import Job
 from mitsim.core.manifests import SIDES as FACTORS
@@ -32,7 +31,7 @@ from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.seeds import stream
 from mitsim.devices.patterns import read_name
 from mitsim.devices.sensor import digital_of
-from mitsim.devices.session import SIDES, Drift, load_recipe
+from mitsim.devices.session import Drift, load_recipe
 from mitsim.reconstruct.accumulation import pattern_response
 from mitsim.reconstruct.factors import Estimate, Factors, decibels
 from mitsim.reconstruct.solver import Pair, Prepared
@@ -192,7 +191,7 @@ def noises_of(stand: DriftStand, lit: LitSession) -> Mapping[tuple[str, str], No
     light, factors = stand.lit.light, (stand.factors.left, stand.factors.right)
     sampled = light.apparent.error_of(light.flux_error) ** 2 + light.apparent.error**2
     found[CAPTURE, RENDERING] = {"light": sampled}
-    left, right = (entry_variances(lit, factors, side) for side in SIDES)
+    left, right = entry_variances(lit.session, lit.uniform_rate, lit.exposure_s, factors)
     for source, own in left.items():
         found[SESSION, source] = {"left": float(own.mean()), "right": float(right[source].mean())}
     return found
@@ -215,23 +214,6 @@ def fixed_data(stand: DriftStand, model: Prepared) -> Pair:
     return uneven, added
 
 
-def entry_variances(lit: LitSession, factors: tuple[FloatArray, FloatArray], side: str) -> dict[str, FloatArray]:
-    """Return the predicted variance (m, n) of the entries in one ``side``'s factor, by source.
-
-    The factor U H^T / N averages the vectors u_i = Y_i v / |v|^2 of N responses with signs. Noise that all responses
-    share enters column p by the mean of its signs: fully where they are all +1, and not at all elsewhere.
-    """
-    signs, common = lit.session.signs, (factors[1] if side == SIDES[0] else factors[0]).sum(axis=1)
-
-    def spread(part: FloatArray) -> FloatArray:
-        variance = np.broadcast_to(part, lit.uniform_rate.shape)
-        return vector_variance(variance if side == SIDES[0] else variance.T, common)
-
-    own, shared = lit.response_variances()
-    even, first = np.full(len(signs), 1 / signs.shape[1]), np.square(signs.mean(axis=1))
-    return {source: np.outer(spread(own[source]), even) + np.outer(spread(shared[source]), first) for source in own}
-
-
 # -------- The study
 
 _SAID_DB = 0.005
@@ -242,11 +224,11 @@ _SAID_DB = 0.005
 def judge_factors(lit: LitSession, noisy: Estimate, clean: Estimate) -> list[Row]:
     """Return errors of each factor beside their prediction, and those of its entries in predicted deviations."""
     rows = list[Row]()
-    pairs = zip(FACTORS, SIDES, (clean.left, clean.right), (noisy.left, noisy.right), strict=True)
-    for name, side, exact, found in pairs:
+    exacts = clean.left, clean.right
+    every = entry_variances(lit.session, lit.uniform_rate, lit.exposure_s, exacts)
+    for name, variances, exact, found in zip(FACTORS, every, exacts, (noisy.left, noisy.right), strict=True):
         # Factors are known up to a common scale and sign; this one is not drawn towards zero by the noise.
         found = found * (np.vdot(exact, exact) / np.vdot(found, exact))
-        variances = entry_variances(lit, (clean.left, clean.right), side)
         deviation = np.asarray(np.sqrt(sum(variances.values(), np.zeros(1))))
         off = (found - exact) / deviation
         norm = float(np.linalg.norm(exact))

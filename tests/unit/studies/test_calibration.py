@@ -11,13 +11,13 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
+from mitsim.calibrate import board_session
 from mitsim.calibrate.calibrate import NOISE_FREE, NOISY, estimates
 from mitsim.core.arrays import FloatArray
 from mitsim.core.configuration import shipped_path
 from mitsim.core.errors import MitsimError
 from mitsim.core.job import Job
 from mitsim.devices.patterns import parse_patterns, stripe_signs
-from mitsim.devices.session import SIDES
 from mitsim.reconstruct.solver import prepare
 from mitsim.report.lit_scene import NONUNIFORMITY, SPECKLE
 from mitsim.studies import calibration_study as module
@@ -31,7 +31,6 @@ from mitsim.studies.calibration_study import (
     SESSION,
     STUDY,
     _tables,
-    entry_variances,
     gain_without,
     judge_factors,
     judge_rest,
@@ -57,16 +56,18 @@ def of_kind(rows: Rows, kind: str) -> Rows:
 def left_deviations(lit: Any, noisy: Any, clean: Any) -> FloatArray:
     """Errors (m, n) of the left factor's entries in predicted deviations."""
     found = noisy.left * (np.vdot(clean.left, clean.left) / np.vdot(noisy.left, clean.left))
-    variances = entry_variances(lit, (clean.left, clean.right), SIDES[0]).values()
-    return np.asarray((found - clean.left) / np.sqrt(sum(variances, np.zeros(1))))
+    variances, _ = board_session.entry_variances(
+        lit.session, lit.uniform_rate, lit.exposure_s, (clean.left, clean.right)
+    )
+    return np.asarray((found - clean.left) / np.sqrt(sum(variances.values(), np.zeros(1))))
 
 
-@pytest.mark.parametrize("mode", ["pair", "uniform"])
-def test_errors_of_factors_are_those_that_are_predicted(mode: str) -> None:
+@pytest.mark.parametrize(("mode", "repeats"), [("pair", 3), ("uniform", 1)])
+def test_errors_of_factors_are_those_that_are_predicted(mode: str, repeats: int) -> None:
     """Over 40 sessions of their own noise: 168 and 189 entries of unit variance each, less what a common scale takes.
     What the uniform shot brings to all responses is in one column alone, and there as much as predicted. (Planted: the
     other side's common vector, N left out; shared noise over all columns, and left out.)"""
-    lit = lit_session(7, mode)
+    lit = lit_session(7, mode, repeats=repeats)
     squares: dict[str, list[float]] = {"left": [], "right": []}
     found_errors, stated_errors, columns = [], [], []
     for seed in range(SEEDS):
@@ -100,7 +101,7 @@ def test_a_part_of_the_error_gains_what_is_left_without_it() -> None:
     assert gain_without(1.0, 4.0, 2.0, 1.0)[1] == pytest.approx(2**0.5 * alone[1])
 
 
-def test_noise_is_told_by_source_and_by_factor() -> None:
+def test_noise_is_told_by_source_and_by_factor(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of a session whose noise is all in a row of pixels that sees no even light: mean over the rows of V over |v|^2 in
     the left factor, whose entries each stand for a row, and none in the right one, which sees rows weighed by v^2.
     Of an ambient frame and of speckle only where there are any. (Planted: both factors by the one side or by the other;
@@ -109,10 +110,12 @@ def test_noise_is_told_by_source_and_by_factor() -> None:
     factors[0][0] = 0.0
     variance = np.zeros((3, 5))
     variance[0] = 6.0
+    both = {"shot noise": variance}, {"shot noise": variance / 2}
+    monkeypatch.setattr(board_session, "response_variances", lambda *_: both)
     session: Any = SimpleNamespace(
         session=SimpleNamespace(signs=stripe_signs(N)),
         uniform_rate=np.ones((3, 5)),
-        response_variances=lambda: ({"shot noise": variance}, {"shot noise": variance / 2}),
+        exposure_s=1.0,
     )
     sampled = SimpleNamespace(flux_error=3.0, apparent=SimpleNamespace(error_of=lambda error: 2 * error, error=0.5))
     expected: Any = SimpleNamespace(has_ambient=False, projector_off=None)
@@ -210,13 +213,12 @@ def test_noise_by_source_is_all_noise() -> None:
     rounding, and that only a uniform shot is shared. (Planted: repeats left out of what is shared.)"""
     for mode in ("pair", "uniform"):
         lit = lit_session(7, mode, devices=CLIPPED, repeats=2)
-        own, shared = lit.response_variances()
+        own, shared = board_session.response_variances(lit.session, lit.uniform_rate, lit.exposure_s)
         assert set(own) == set(shared) == {"shot noise", "dark current", "read noise", "quantisation"}
         whole = sum(part.mean() for parts in (own, shared) for part in parts.values())
         assert whole == pytest.approx(lit.response_noise**2)
         assert all(part.any() == (mode == "uniform") for part in shared.values())
     sensor, time = CLIPPED.sensor, EXPOSURE_S
-    own, shared = lit_session(7, "uniform", devices=CLIPPED, repeats=2).response_variances()
     dark, read = sensor.dark_current_e_per_s / time, sensor.read_noise_e**2 / time**2
     assert own["dark current"] == pytest.approx(4 * dark / 2)
     assert shared["dark current"] == pytest.approx(dark / 2)
