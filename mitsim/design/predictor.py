@@ -204,7 +204,7 @@ class Predictor:
         The sum of squares of e + x then has the variance 2 tr C^2 + 4 sum_i C_ii e_i^2 (Searle, Linear Models, 1971,
         section 2.5). Noise of a factor is correlated only between coefficients of one row, or of one column.
         """
-        square, variance, errors = np.square(self._gain(lam)), 0.0, self._by_coefficient(lam)
+        square, variance, errors = np.square(self.prepared.gain(lam)), 0.0, self._by_coefficient(lam)
         for axis, weights in enumerate((square, square.T)):
             variances, data = self._factor_data(axis)
             light = self._mean_of(data) if axis == 0 else self._mean_of(data).T
