@@ -460,6 +460,13 @@ def size_of(values: npt.NDArray[np.generic] | Sequence[int]) -> str:
     return "x".join(map(str, getattr(values, "shape", values)))
 
 
+def reduce_frame(frame: Numbers, reduce: int) -> Numbers:
+    """Return the means of whole blocks of ``reduce`` x ``reduce`` pixels, in the type of ``frame``."""
+    rows, columns = (size // reduce for size in frame.shape)
+    blocks = frame[: rows * reduce, : columns * reduce].reshape(rows, reduce, columns, reduce)
+    return np.asarray(blocks.mean(axis=(1, 3)), frame.dtype)
+
+
 def write_numbers(path: Path, values: Numbers) -> None:
     """Write whole numbers of 8 or 16 bits to a PNG or TIFF file, or any numbers to an NPY file; whole or not at all."""
     from PIL import Image
@@ -513,11 +520,9 @@ def fit_square(reflectance: FloatArray) -> FloatArray:
     """Centre a picture in a black square; above 4096 pixels a side, means over equal blocks reduce it first."""
     block = -(-max(reflectance.shape) // _MOST_SIDE)
     if block > 1:
-        for axis, size in enumerate(reflectance.shape):
-            starts = np.arange(0, size, block)
-            counts = np.diff(np.append(starts, size))
-            sums = np.add.reduceat(reflectance, starts, axis=axis)
-            reflectance = sums / (counts[:, None] if axis == 0 else counts)
+        from PIL import Image
+
+        reflectance = np.asarray(Image.fromarray(reflectance.astype(np.float32)).reduce(block), np.float64)
     side = max(reflectance.shape)
     before = [(side - own) // 2 for own in reflectance.shape]
     return np.pad(reflectance, [(gap, side - own - gap) for gap, own in zip(before, reflectance.shape, strict=True)])

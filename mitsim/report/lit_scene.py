@@ -35,7 +35,7 @@ from mitsim.core.arrays import FloatArray
 from mitsim.core.environment import versions
 from mitsim.core.errors import MitsimError, check_arguments
 from mitsim.core.files import write_bytes
-from mitsim.core.images import lightness
+from mitsim.core.images import lightness, reduce_frame
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.mask import CameraMask
@@ -204,20 +204,13 @@ def peak_time(bench: Apparatus, expected: ExpectedFrames) -> float:
     return Exposure().choose(bench.devices, peak_irradiance(expected))
 
 
-def bin_frame(frame: FloatArray, binning: int) -> FloatArray:
-    if binning == 1:
-        return frame
-    rows, columns = (size // binning for size in frame.shape)
-    return np.asarray(frame.reshape(rows, binning, columns, binning).mean(axis=(1, 3)))
-
-
 def accumulate(
     exposer: Exposer, family: PatternFamily, expected: ExpectedFrames, models: Sequence[Prepared], binning: int = 1
 ) -> list[Accumulator]:
     sums = [model.accumulator() for model in models]
     with single_threaded_blas():
         for measurement, row, column in measured(exposer, family, expected):
-            frame = bin_frame(measurement, binning)
+            frame = reduce_frame(measurement, binning)
             for each in sums:
                 each.add(frame, row, column)
     return sums
