@@ -21,5 +21,5 @@ def estimated(
     sums = stripe_sums(*next(pairs), signs.shape[1], centre)
     for pair in pairs:
         for side, response in zip(sums, pair, strict=True):
-            side.put(side.fit_response(response, side.done))
+            side.put(side.fit_response(response))
     return factors_of_sums(*sums, signs, noise)

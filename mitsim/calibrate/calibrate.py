@@ -335,7 +335,7 @@ def session_sums(
 
     def fit_responses(sums: Sequence[StripeSums], shown: tuple[int, Frame]) -> list[tuple[ResponseFit, int]]:
         each = zip(sums, respond(sums[0].side, *shown), strict=True)
-        return [(own.fit_response(r.rate, shown[0], r.light), r.saturated) for own, r in each]
+        return [(own.fit_response(r.rate, r.light), r.saturated) for own, r in each]
 
     if (arrays := checkpoint.load()) is not None:
         saturated = int(arrays["saturated"])

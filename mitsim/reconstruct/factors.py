@@ -110,9 +110,8 @@ class StripeSums:
         self.ambient = np.zeros((self.vectors.shape[1], 3))
         self.lights = np.zeros((len(self.vectors), 0))
 
-    def fit_response(self, response: npt.ArrayLike, number: int, light: FloatArray | None = None) -> ResponseFit:
-        across, shape, given = self.side == "horizontal", (len(self.vectors), len(self.common)), np.asarray(response)
-        response = _response(given, f"{self.side} response {number}", shape if across else shape[::-1], self.centre)
+    def fit_response(self, given: FloatArray, light: FloatArray | None = None) -> ResponseFit:
+        across, response = self.side == "horizontal", centre_frame(given) if self.centre else given
         common = self.common / np.dot(self.common, self.common)
         vector = (response if across else response.T) @ common
         rows, columns = (vector, self.common) if across else (self.common, vector)
@@ -143,20 +142,19 @@ class StripeSums:
 
 
 def stripe_sums(
-    horizontal: npt.ArrayLike,
-    vertical: npt.ArrayLike,
+    horizontal: FloatArray,
+    vertical: FloatArray,
     count: int,
     centre: bool = False,
     lights: Sequence[FloatArray | None] = (None, None),
 ) -> tuple[StripeSums, StripeSums]:
-    first = _response(horizontal, "horizontal response 0", None, centre)
-    second = _response(vertical, "vertical response 0", first.shape, centre)
+    first, second = (centre_frame(each) if centre else each for each in (horizontal, vertical))
     mean = (upright(first, horizontal) + upright(second, vertical)) / 2
     a, v = _rank_one_split(mean)
     left = StripeSums("horizontal", centre, v, np.empty((len(a), count)))
     right = StripeSums("vertical", centre, a, np.empty((len(v), count)))
     for sums, response, light in zip((left, right), (horizontal, vertical), lights, strict=True):
-        sums.put(sums.fit_response(response, 0, light))
+        sums.put(sums.fit_response(response, light))
     return left, right
 
 
@@ -318,19 +316,6 @@ def _rank_one_split(mean: FloatArray) -> Pair:
         raise MitsimError("the uniform response is zero everywhere; check exposure and black level")
     root = np.sqrt(size) if left.sum() >= 0 else -np.sqrt(size)
     return left * (root / size), right * root
-
-
-# ---- Responses and patterns as they are read ----
-
-
-def _response(response: npt.ArrayLike, name: str, shape: tuple[int, ...] | None, centre: bool) -> FloatArray:
-    values = np.asarray(response, dtype=np.float64)
-    if values.ndim != 2 or values.size == 0 or (shape is not None and values.shape != shape):
-        raise MitsimError(f"{name} has shape {values.shape}; allowed is {shape or 'a 2-D array'}, as the first")
-    if not np.isfinite(values).all():
-        bad = np.count_nonzero(~np.isfinite(values))
-        raise MitsimError(f"{name} has {bad} values that are not finite; capture it again")
-    return centre_frame(values) if centre else values
 
 
 # ---- Factors of a calibrated camera ----
