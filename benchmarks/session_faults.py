@@ -36,8 +36,9 @@ from mitsim.devices.mask import mls_mask
 from mitsim.devices.patterns import stripe_signs
 from mitsim.devices.session import SIDES, UNIFORM, Half, halves_in_order
 from mitsim.reconstruct.captured_session import calibrate_frames
-from mitsim.reconstruct.factors import Factors, estimate_factors, predicted_error
+from mitsim.reconstruct.factors import Factors, predicted_error
 from tests.shadow_factor import scene_factor
+from tests.stripes import estimated
 
 NOISE = 2.3e-3
 """Relative error of both factors, in quadrature, that the shipped session leaves with the anchor camera."""
@@ -139,7 +140,7 @@ class Camera:
         """Factors as a calibration has them, of a session without noise and fault, of unit light."""
         signs = stripe_signs(self.n).astype(float)
         one = np.ones(self.n)
-        found = estimate_factors(
+        found = estimated(
             (self.light(np.outer(column, one)) for column in signs.T),
             (self.light(np.outer(one, column)) for column in signs.T),
             signs,

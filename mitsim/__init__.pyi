@@ -8,8 +8,6 @@ from mitsim.api.bench import open_bench as open_bench
 from mitsim.api.bench import shelf_scene as shelf_scene
 from mitsim.bench.request import Request as Request
 from mitsim.calibrate.model import calibrate_model as calibrate_model
-from mitsim.calibrate.session_plan import CalibrationPlan as CalibrationPlan
-from mitsim.calibrate.session_plan import plan_calibration as plan_calibration
 from mitsim.core.errors import ArgumentError as ArgumentError
 from mitsim.core.errors import MitsimError as MitsimError
 from mitsim.core.job import Clock as Clock
@@ -22,6 +20,8 @@ from mitsim.core.runs import load_mosaic as load_mosaic
 from mitsim.core.runs import load_run as load_run
 from mitsim.design.goal import Goal as Goal
 from mitsim.design.predict import Prediction as Prediction
+from mitsim.design.session_plan import CalibrationPlan as CalibrationPlan
+from mitsim.design.session_plan import plan_calibration as plan_calibration
 from mitsim.devices.session import Modelling as Modelling
 from mitsim.devices.session import load_recipe as load_recipe
 from mitsim.exchange.formats import export as export

@@ -477,27 +477,27 @@ def test_samples_are_not_added_up_in_32_bits() -> None:
 # ---- sizes and names -------------------------------------------------------------------------------------------------
 
 SIZES = {
-    "acquire": (5, 1210),
+    "acquire": (5, 1198),
     "api": (2, 188),
     "bench": (5, 1195),
-    "calibrate": (5, 1191),
+    "calibrate": (4, 963),
     "cli": (6, 1553),
-    "core": (17, 3148),
-    "design": (8, 1367),
-    "devices": (9, 2246),
+    "core": (17, 3153),
+    "design": (9, 1573),
+    "devices": (9, 2240),
     "exchange": (7, 1633),
     "learn": (5, 1194),
     "light": (6, 1672),
     "optics": (7, 1751),
     "planner": (6, 1627),
-    "reconstruct": (16, 5561),
-    "report": (6, 1991),
-    "scene": (5, 1353),
+    "reconstruct": (16, 5499),
+    "report": (6, 1883),
+    "scene": (5, 1349),
     "sensor": (4, 1105),
     "sessions": (4, 903),
-    "studies": (25, 5503),
+    "studies": (24, 5000),
     "top level": (5, 525),
-    "transport": (15, 3982),
+    "transport": (15, 3948),
 }
 """Files and lines of code of each room. The limits only ever fall: a change that needs more in one room takes it from
 another, and says which code went."""

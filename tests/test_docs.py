@@ -189,18 +189,6 @@ def test_the_exit_statuses_of_the_table(status: str, line: str, sentence: str, t
 # ---- Python ----------------------------------------------------------------------------------------------------------
 
 
-def measured_responses() -> dict[str, object]:
-    """Return the responses that docs/real_camera.md uses: a separable camera of 144 pixels, 128 stripes a side."""
-    from scipy.linalg import hadamard
-
-    rng = np.random.default_rng(0)
-    left, right, stripes = rng.random((144, 128)), rng.random((144, 128)), hadamard(128)
-    return {
-        "horizontal": [np.outer(left @ stripe, right.sum(axis=1)) for stripe in stripes.T],
-        "vertical": [np.outer(left.sum(axis=1), right @ stripe) for stripe in stripes.T],
-    }
-
-
 def exchanged_file() -> dict[str, object]:
     """The files that docs/exchange.md reads."""
     from mitsim.api.bench import open_bench
@@ -233,7 +221,6 @@ def made_folders() -> dict[str, object]:
 
 GIVEN: dict[str, Callable[[], dict[str, object]]] = {
     "docs/api.md": made_folders,
-    "docs/real_camera.md": measured_responses,
     "docs/exchange.md": exchanged_file,
     "docs/learned.md": stored_pairs,
 }

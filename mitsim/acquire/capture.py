@@ -25,7 +25,7 @@ from mitsim.bench.request import FEWEST_PASSES, REFERENCE, Request, Task, Workin
 from mitsim.core import colour_files, manifests
 from mitsim.core.arrays import FloatArray
 from mitsim.core.configuration import Drawn, takes
-from mitsim.core.environment import DEFAULT_VARIANT, deciding_versions, keep_scenes, load_variant, versions
+from mitsim.core.environment import deciding_versions, keep_scenes, versions
 from mitsim.core.errors import ArgumentError, MitsimError, check_arguments, cut
 from mitsim.core.exr import Channel, write_frame
 from mitsim.core.files import FRAMES, output_folder
@@ -584,14 +584,8 @@ def render(bench: Apparatus, estimator: str, spp: int | None, asked: Request, jo
     return rendered
 
 
-def rendered_psf(
-    shape: tuple[int, int], pitch_mm: float, variant: str = DEFAULT_VARIANT, rays: int = 4096, seed: int = 0
-) -> FloatArray:
-    """Return the light of a distant point behind the default diffuser, with a sum of 1.
-
-    The ``variant`` of Mitsuba is selected for the process.
-    """
-    load_variant(variant)
+def rendered_psf(shape: tuple[int, int], pitch_mm: float, rays: int = 4096, seed: int = 0) -> FloatArray:
+    """Return the light of a distant point behind the default diffuser, with a sum of 1."""
     from mitsim.transport.plugins.lens import Diffuser, point_spread
 
     light = point_spread(Diffuser(), shape, pitch_mm, rays=rays, seed=seed)

@@ -10,14 +10,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mitsim.bench.request import Irradiance, check_ending, check_image
-from mitsim.core.arrays import FloatArray, npy_header
+from mitsim.core import images
+from mitsim.core.arrays import FloatArray
 from mitsim.core.configuration import Drawn, takes
 from mitsim.core.environment import versions
 from mitsim.core.errors import MitsimError, check_arguments
 from mitsim.core.exr import Channel, finite_channel, read_frame, write_frame
-from mitsim.core.files import FRAME_LIMITS, fits_a_frame
-from mitsim.core.images import from_above, write_numbers
-from mitsim.core.job import Cost, Limits
+from mitsim.core.picture_files import Wanted
 from mitsim.core.seeds import stream
 from mitsim.devices.sensor import EXPOSURE_S, SensorModel
 from mitsim.sensor.chain import Digital, electrons_from_irradiance, expose, exposure_for_peak, saturated_pixels
@@ -27,8 +26,7 @@ if TYPE_CHECKING:
 
 _LUMINANCE = {"R": 0.2126, "G": 0.7152, "B": 0.0722}
 """Weights of linear RGB in luminance (ITU-R BT.709)."""
-_PIXEL_BYTES = 100
-"""Memory per pixel: some ten arrays of double precision."""
+_IMAGE = Wanted("image", bits=(1, 8, 16, 32))
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +70,7 @@ class Sensed:
     def plot(self, ax: Axes | None = None, **figure: Any) -> Axes:
         """Draw the digital numbers with a colour bar on ``ax`` or a new figure, and return the axes."""
         title = f"{self.sensor.name}, exposure {self.exposure_s:.3g} s"
-        return from_above("report.plots", "draw_frame")(self.digital, title, "digital number [DN]", ax, **figure)
+        return images.from_above("report.plots", "draw_frame")(self.digital, title, "digital number [DN]", ax, **figure)
 
     def __repr__(self) -> str:
         rows, columns = self.digital.shape
@@ -95,7 +93,9 @@ class Sensed:
             channels = {"DN": numbers, "electrons": self.electrons.astype(np.float32)}
             write_frame(path, channels, {"camera": self.sensor.name, **facts, **versions()})
         else:
-            write_numbers(path, self.digital.astype(np.uint16) if path.suffix.lower() == ".png" else self.digital)
+            images.write_numbers(
+                path, self.digital.astype(np.uint16) if path.suffix.lower() == ".png" else self.digital
+            )
         return path
 
 
@@ -159,17 +159,7 @@ def read_image(path: Path | str, channel: str | None = None) -> tuple[FloatArray
     if path.suffix.lower() == ".npy":
         if channel is not None:
             raise MitsimError(f"image {path}: an array has no channel {channel!r}; name none")
-        try:
-            with open(path, "rb") as file:
-                shape, dtype = npy_header(file, path.stat().st_size)
-                if dtype.kind not in "buif":
-                    raise ValueError(f"{dtype} are no real numbers")
-                if not fits_a_frame(shape):
-                    raise ValueError(f"its shape is {shape}; {FRAME_LIMITS} are allowed")
-                Cost(memory_bytes=_PIXEL_BYTES * math.prod(shape)).check(f"image {path}", Limits())
-                return np.asarray(np.load(file, allow_pickle=False), dtype=np.float64), ()
-        except (OSError, ValueError) as error:
-            raise MitsimError(f"image {path}: not an array of numbers ({error}); save one by numpy.save") from error
+        return images.read_image(path, _IMAGE).astype(np.float64), ()
     channels = {name: values for name, values in read_frame(path)[0].items() if not name.startswith("error.")}
     if channel is None and {*_LUMINANCE} <= {*channels}:
         light = sum(weight * finite_channel(channels, name, path) for name, weight in _LUMINANCE.items())

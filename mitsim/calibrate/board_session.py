@@ -365,6 +365,29 @@ def response_variances(
     return own, shared
 
 
+def entry_variances(
+    session: Session, uniform_rate: FloatArray, exposure_s: float, factors: tuple[FloatArray, FloatArray]
+) -> list[dict[str, FloatArray]]:
+    """Return the variances (m, n) of the entries of the left and of the right factor, by source.
+
+    u_i = Y_i v / |v|^2, v the sum of the other factor's columns, has the variance sum_c V_rc v_c^2 / |v|^4 in row r,
+    V being that of a response's pixels. U H^T / N averages N of them with signs, and the rows of H are orthogonal.
+    Noise that all responses share enters column p by the mean of its signs: fully where they are all +1, and not at all
+    elsewhere. Noise of v is of second order.
+    """
+    signs, found = session.signs, list[dict[str, FloatArray]]()
+    columns = np.full(len(signs), 1 / signs.shape[1]), np.square(signs.mean(axis=1))
+    for axis, other in enumerate(factors[::-1]):
+        common, parts = other.sum(axis=1), dict[str, FloatArray]()
+        weights = np.square(common / np.dot(common, common))
+        for variances, even in zip(response_variances(session, uniform_rate, exposure_s), columns, strict=True):
+            for source, variance in variances.items():
+                rows = np.moveaxis(np.broadcast_to(variance, uniform_rate.shape), axis, 0) @ weights
+                parts[source] = parts.get(source, 0.0) + np.outer(rows, even)
+        found.append(parts)
+    return found
+
+
 @dataclass(frozen=True, eq=False)
 class LitSession:
     """A session with traced light: its responses, with or without noise.
@@ -403,12 +426,9 @@ class LitSession:
     @property
     def response_noise(self) -> float:
         """Standard deviation of a number of a response [electrons / s], its mean over all pixels."""
-        every = [part for parts in self.response_variances() for part in parts.values()]
+        both = response_variances(self.session, self.uniform_rate, self.exposure_s)
+        every = [part for parts in both for part in parts.values()]
         return float(np.sqrt(sum(every, np.zeros(self.uniform_rate.shape)).mean()))
-
-    def response_variances(self) -> tuple[dict[str, FloatArray], dict[str, FloatArray]]:
-        """Return noise variances of each response's own, and of a side's shared; see :func:`response_variances`."""
-        return response_variances(self.session, self.uniform_rate, self.exposure_s)
 
     def each(self, side: str, use: Callable[[tuple[int, Frame]], Result], job: Job, first: int = 0) -> Iterator[Result]:
         """Apply ``use`` to number and expected frame of the +-1 patterns of a ``side``, in threads.

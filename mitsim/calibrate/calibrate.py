@@ -1,7 +1,8 @@
 """Rendered calibration sessions, and factors that are estimated from them as from a user's frames.
 
-Finished parts are kept in the CAL folder for a resumed session, as ``.npz`` files with a SHA-256 of configuration and
-data; a damaged or foreign part is computed again.
+Sums over finished stripes are kept in the CAL folder for a resumed session, as an ``.npz`` file with a SHA-256 of
+configuration and data; a damaged or foreign file is computed again. Light is traced again, because its seed makes it
+bit-equal, and because tracing takes a fiftieth of a session.
 """
 
 from __future__ import annotations
@@ -21,7 +22,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy import sparse
 
 from mitsim.acquire.capture import colour_folder
 from mitsim.acquire.spectral import SpectralBench, without_filters
@@ -32,7 +32,7 @@ from mitsim.core.arrays import FloatArray
 from mitsim.core.colour_files import CALIBRATION
 from mitsim.core.environment import deciding_versions, versions
 from mitsim.core.errors import MitsimError
-from mitsim.core.files import PARTS, output_folder, plain, remove_page, whole_file, whole_folder, write_json
+from mitsim.core.files import output_folder, plain, remove_page, whole_file, whole_folder, write_json
 from mitsim.core.job import Cost, Job, Limits
 from mitsim.core.manifests import MANIFEST, other_request, resumable
 from mitsim.core.parallel import single_threaded_blas
@@ -41,7 +41,6 @@ from mitsim.devices.framelist import LISTS, FrameList
 from mitsim.devices.sensor import digital_of
 from mitsim.devices.session import SIDES, load_recipe
 from mitsim.light.light import SampledLight
-from mitsim.light.passes import GRIDS, LightEstimate, Simulation
 from mitsim.light.plan import Plan
 from mitsim.optics.frames import Frame
 from mitsim.optics.terms import lacking
@@ -63,15 +62,15 @@ NOISY, NOISE_FREE = "noisy", "noise_free"
 _SAVED_EVERY, _SAVED_AFTER_S = 8, 0.5
 """Responses and seconds between two checkpoints."""
 _REPEATS_BEHIND_FILTERS = 4
+"""Default repeats behind filters, because most pixels see a tenth of a line that fills others."""
 _AS_STATED = 1.2
 """Ratio of measured to stated residual up to which the stated camera explains it."""
-"""Default repeats behind filters, because most pixels see a tenth of a line that fills others."""
 
 
-# ---- Finished parts of a session in its folder ----
+# ---- Finished stripes of a session in its folder ----
 
 KIND = "calibration"
-_SUFFIX = PARTS.removeprefix("*")
+STRIPES = "stripes.part.npz"
 _DIGEST = hashlib.sha256().digest_size
 
 
@@ -86,17 +85,17 @@ class Checkpoint:
             head = {"kind": KIND, "status": "incomplete", "configuration": plain(self.configuration)}
             write_json(self.folder / MANIFEST, head)
 
-    def save(self, name: str, arrays: Mapping[str, npt.ArrayLike]) -> None:
+    def save(self, arrays: Mapping[str, npt.ArrayLike]) -> None:
         if self.folder is None:
             return
         memory = io.BytesIO()
         np.savez(memory, allow_pickle=False, **{key: np.asarray(value) for key, value in arrays.items()})
-        with whole_file(self.folder / f"{name}{_SUFFIX}") as part, part.open("wb") as file:
+        with whole_file(self.folder / STRIPES) as part, part.open("wb") as file:
             file.write(memory.getbuffer())
             file.write(self._digest(memory.getbuffer()))
 
-    def load(self, name: str) -> dict[str, npt.NDArray[Any]] | None:
-        path = None if self.folder is None else self.folder / f"{name}{_SUFFIX}"
+    def load(self) -> dict[str, npt.NDArray[Any]] | None:
+        path = None if self.folder is None else self.folder / STRIPES
         if path is None or not path.is_file():
             return None
         data = memoryview(path.read_bytes())
@@ -107,39 +106,10 @@ class Checkpoint:
 
     def clear(self) -> None:
         if self.folder is not None:
-            for path in self.folder.glob(PARTS):
-                path.unlink()
+            (self.folder / STRIPES).unlink(missing_ok=True)
 
     def _digest(self, data: memoryview) -> bytes:
         return hashlib.sha256(hashlib.sha256(self._session).digest() + data).digest()
-
-
-# ---- Light and sums of responses as parts of a checkpoint ----
-
-
-def kept_light(checkpoint: Checkpoint, session: Session, plan: Plan) -> SampledLight | None:
-    arrays = checkpoint.load("light")
-    if arrays is None:
-        return None
-    by_grid = {
-        name: sparse.csr_array(
-            tuple(arrays[f"{row.key}_{part}"] for part in ("data", "indices", "indptr")),
-            shape=tuple(arrays[f"{row.key}_shape"]),
-        )
-        for name, row in GRIDS.items()
-    }
-    return SampledLight(
-        groups=(LightEstimate(by_grid, float(arrays["received"]), float(arrays["outside"])),),
-        simulation=Simulation(session.board, plan.settings),
-        plan=plan,
-        seed=session.seed,
-        labels=arrays["labels"],
-        flux=arrays["flux"],
-        flux_error=arrays["flux_error"],
-        paths=int(arrays["paths"]),
-        sampling_error=float(arrays["sampling_error"]),
-        reached=bool(arrays["reached"]),
-    )
 
 
 # ---- Sessions ----
@@ -246,19 +216,8 @@ def _run_sessions(
             checkpoint = Checkpoint(folder, configuration)
             plan = plan or whole.plan(accuracy, job)
             checkpoint.begin()
-            light = kept_light(checkpoint, session, plan)
-            if light is None:
-                lights = lights or whole.trace(plan, job, [each.board for each in lines])
-                light = lights[number]
-                (group,) = light.groups
-                own = ("labels", "flux", "flux_error", "paths", "sampling_error", "reached")
-                facts = {name: getattr(light, name) for name in own}
-                facts |= {name: getattr(group, name) for name in ("received", "outside")}
-                for name, row in GRIDS.items():
-                    parts = ("data", "indices", "indptr", "shape")
-                    facts |= {f"{row.key}_{part}": getattr(group[name], part) for part in parts}
-                checkpoint.save("light", facts)
-            lit = replace(LitSession.of(session, light, job), kept=frames)
+            lights = lights or whole.trace(plan, job, [each.board for each in lines])
+            lit = replace(LitSession.of(session, lights[number], job), kept=frames)
             found.append(_factors(lit, checkpoint, job))
     return found
 
@@ -376,9 +335,9 @@ def session_sums(
 
     def fit_responses(sums: Sequence[StripeSums], shown: tuple[int, Frame]) -> list[tuple[ResponseFit, int]]:
         each = zip(sums, respond(sums[0].side, *shown), strict=True)
-        return [(own.fit_response(r.rate, shown[0], r.light), r.saturated) for own, r in each]
+        return [(own.fit_response(r.rate, r.light), r.saturated) for own, r in each]
 
-    if (arrays := checkpoint.load("stripes")) is not None:
+    if (arrays := checkpoint.load()) is not None:
         saturated = int(arrays["saturated"])
         for kind in kinds:
             both = []
@@ -408,6 +367,6 @@ def session_sums(
                 for kind, each in product(kinds, (0, 1)):
                     named = vars(found[kind][each]).items()
                     parts |= {f"{kind}_{SIDES[each]}_{name}": values for name, values in named if name != "side"}
-                checkpoint.save("stripes", parts)
+                checkpoint.save(parts)
                 saved = time.monotonic()
     return found, saturated

@@ -169,7 +169,7 @@ def _plan(asked: Calibrating, _: Path) -> int:
     asked.check(asked.scene, patterns, Exposure(None, recipe.exposure_fraction))
     with asked.job() as job:
         bench = open_as(asked.scene, asked, job)
-        from mitsim.calibrate.session_plan import plan_calibration
+        from mitsim.design.session_plan import plan_calibration
 
         with nullcontext() if output is None else output_file(output, asked.overwrite):
             light = {"seed": asked.seed, "accuracy": asked.accuracy}

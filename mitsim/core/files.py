@@ -27,8 +27,8 @@ _NAME_BYTES = 120
 """Keeps names of hidden files below the limit of 255 bytes."""
 _KINDS = {stat.S_IFCHR: "a device", stat.S_IFBLK: "a device", stat.S_IFIFO: "a named pipe", stat.S_IFSOCK: "a socket"}
 _LONGEST_HEAD = 1 << 20
-FRAMES, PARTS = "frame_*.exr", "*.part.npz"
-"""Files that an unfinished capture or calibration has completed."""
+FRAMES = "frame_*.exr"
+"""Files that an unfinished capture has completed."""
 PAIRS = "pairs.json"
 """Manifest of a store of pairs."""
 

@@ -60,6 +60,11 @@ _UPRIGHT = 1
 _TURNS = {1: (0, False), 2: (0, True), 3: (2, False), 4: (2, True), 5: (-1, True), 6: (-1, False), 7: (1, True)}
 _TURNS[8] = (1, False)
 """Counter-clockwise quarter turns, and whether left and right are swapped afterwards (TIFF 6.0, tag 274)."""
+ORIENTATIONS = {
+    "upright": 1, "mirrored": 2, "upside down": 4, "turned": 3, "transposed": 5,
+    "transposed, mirrored": 6, "transposed, upside down": 8, "transposed, turned": 7,
+}  # fmt: skip
+"""Orientations of TIFF 6.0 and Exif by the words of lists and messages."""
 _MOST_PAGES = 1 << 16
 _PIXEL_BYTES = 24
 """Memory of a pixel while a page is read and checked; measured: at most 21, for a PNG of 16 bits."""
@@ -526,6 +531,13 @@ def size_of(values: npt.NDArray[np.generic] | Sequence[int]) -> str:
     return "x".join(map(str, getattr(values, "shape", values)))
 
 
+def reduce_frame(frame: Numbers, reduce: int) -> Numbers:
+    """Return the means of whole blocks of ``reduce`` x ``reduce`` pixels, in the type of ``frame``."""
+    rows, columns = (size // reduce for size in frame.shape)
+    blocks = frame[: rows * reduce, : columns * reduce].reshape(rows, reduce, columns, reduce)
+    return np.asarray(blocks.mean(axis=(1, 3)), frame.dtype)
+
+
 def write_numbers(path: Path, values: Numbers) -> None:
     """Write whole numbers of 8 or 16 bits to a PNG or TIFF file, or any numbers to an NPY file; whole or not at all."""
     from PIL import Image
@@ -579,11 +591,9 @@ def fit_square(reflectance: FloatArray) -> FloatArray:
     """Centre a picture in a black square; above 4096 pixels a side, means over equal blocks reduce it first."""
     block = -(-max(reflectance.shape) // _MOST_SIDE)
     if block > 1:
-        for axis, size in enumerate(reflectance.shape):
-            starts = np.arange(0, size, block)
-            counts = np.diff(np.append(starts, size))
-            sums = np.add.reduceat(reflectance, starts, axis=axis)
-            reflectance = sums / (counts[:, None] if axis == 0 else counts)
+        from PIL import Image
+
+        reflectance = np.asarray(Image.fromarray(reflectance.astype(np.float32)).reduce(block), np.float64)
     side = max(reflectance.shape)
     before = [(side - own) // 2 for own in reflectance.shape]
     return np.pad(reflectance, [(gap, side - own - gap) for gap, own in zip(before, reflectance.shape, strict=True)])

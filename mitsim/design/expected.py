@@ -75,7 +75,8 @@ def expected_error(
     Parameters
     ----------
     grams
-        M of the left and of the right side, (n, n) and (n', n').
+        M of the left and of the right side, (n, n) and (n', n'), or its blocks (groups, size, size) if M is block
+        diagonal in the order of the scene's pixels. Of A and B these blocks suffice.
     causes
         Causes of error.
     scenes
@@ -88,6 +89,8 @@ def expected_error(
     mu, left = np.linalg.eigh(grams[0])
     nu, right = (mu, left) if grams[1] is grams[0] else np.linalg.eigh(grams[1])
     mu, nu = np.maximum(mu, 0.0), np.maximum(nu, 0.0)
+    rows, columns = mu.ravel(), nu.ravel()
+    product = np.outer(rows, columns)
     products = dict[tuple[int, int], FloatArray]()  # causes share matrices
 
     def times(matrix: FloatArray, basis: FloatArray) -> FloatArray:
@@ -96,21 +99,24 @@ def expected_error(
             products[key] = matrix @ basis
         return products[key]
 
-    turned = [(times(a, left), times(b, right)) for a, b in (cause.matrices for cause in causes)]
-    seen = [((left * a).sum(axis=0), (right * b).sum(axis=0)) for a, b in turned]
+    def turned_by(basis: FloatArray, matrix: FloatArray) -> FloatArray:
+        return (basis.mT @ matrix.reshape(*basis.shape[:-1], -1)).reshape(matrix.shape)
 
-    coefficients = [left.T @ scene @ right for scene in scenes]
+    turned = [(times(a, left), times(b, right)) for a, b in (cause.matrices for cause in causes)]
+    seen = [((left * a).sum(axis=-2).ravel(), (right * b).sum(axis=-2).ravel()) for a, b in turned]
+    of_rows = np.stack([own * rows ** cause.powers[0] for (own, _), cause in zip(seen, causes, strict=True)])
+    of_columns = np.stack([own * columns ** cause.powers[1] for (_, own), cause in zip(seen, causes, strict=True)])
+
+    coefficients = [turned_by(right, turned_by(left, scene).T).T for scene in scenes]
     energy = sum(np.square(each) for each in coefficients) / len(scenes)
 
     def sums(value: float) -> list[float]:
-        inverse = 1 / np.square(np.outer(mu, nu) + value)
-        both = zip((cause.powers for cause in causes), seen, strict=True)
-        found = [float((a * mu**i) @ inverse @ (b * nu**j)) for (i, j), (a, b) in both]
-        return [*found, value**2 * float(np.vdot(inverse, energy))]
+        inverse = 1 / np.square(product + value)
+        return [*((of_rows @ inverse) * of_columns).sum(axis=1).tolist(), value**2 * float(np.vdot(inverse, energy))]
 
     weights = [*(cause.weight for cause in causes), 1.0]
     if lam is None:
-        largest = float(mu[-1] * nu[-1])
+        largest = float(product.max())
         trial = minimize_scalar(
             lambda power: float(np.dot(weights, sums(largest * 10.0**power))), bounds=_DECADES, method="bounded",
             options={"xatol": 1e-3},
@@ -122,34 +128,33 @@ def expected_error(
         parts[cause.name] += cause.weight * one
     if not slopes:
         return ExpectedError(lam, parts, found)
-    once = 1 / (np.outer(mu, nu) + lam)
+    once = 1 / (product + lam)
     inverse, matrices = np.square(once), []
     of_left, of_right = np.zeros_like(grams[0]), np.zeros_like(grams[1])
     for each in coefficients:
-        rows = (each * once * nu) @ (each * inverse).T
-        columns = (each * once * mu[:, None]).T @ (each * inverse)
-        of_left -= lam**2 / len(scenes) * (rows + rows.T)
-        of_right -= lam**2 / len(scenes) * (columns + columns.T)
-    for cause, (a, b), (own, other) in zip(causes, turned, seen, strict=True):
+        halves = (each * once * columns, each * inverse), ((each * once * rows[:, None]).T, (each * inverse).T)
+        for of, half, basis in zip((of_left, of_right), halves, (left, right), strict=True):
+            first, second = (matrix.reshape(*basis.shape[:-1], -1) for matrix in half)
+            of -= lam**2 / len(scenes) * (first @ second.mT + second @ first.mT)
+    for cause, (a, b), own, other in zip(causes, turned, of_rows, of_columns, strict=True):
         (i, j), weight = cause.powers, cause.weight
-        by_left, by_right = other * nu**j, own * mu**i
-        of_left += weight * (left.T @ a) * _divided(mu, nu, lam, i, by_left)
-        of_right += weight * (right.T @ b) * _divided(nu, mu, lam, j, by_right)
-        gains = weight * mu**i * (inverse @ by_left), weight * nu**j * (by_right @ inverse)
-        matrices.append(((left * gains[0]) @ left.T, (right * gains[1]) @ right.T))
-    return ExpectedError(lam, parts, found, (left @ of_left @ left.T, right @ of_right @ right.T), tuple(matrices))
+        of_left += weight * (left.mT @ a) * _divided(mu, columns, lam, i, other)
+        of_right += weight * (right.mT @ b) * _divided(nu, rows, lam, j, own)
+        by_left = weight * (rows**i * (inverse @ other)).reshape(mu.shape)[..., None, :]
+        by_right = weight * (columns**j * (own @ inverse)).reshape(nu.shape)[..., None, :]
+        matrices.append(((left * by_left) @ left.mT, (right * by_right) @ right.mT))
+    return ExpectedError(lam, parts, found, (left @ of_left @ left.mT, right @ of_right @ right.mT), tuple(matrices))
 
 
 def _divided(mu: FloatArray, nu: FloatArray, lam: float, power: int, weights: FloatArray) -> FloatArray:
-    """Return divided differences (n, n) of g(mu) = sum_b w_b mu^i / (mu nu_b + lambda)^2 between all eigenvalues."""
-    once = 1 / (np.outer(mu, nu) + lam)
+    """Return divided differences of g(mu) = sum_b w_b mu^i / (mu nu_b + lambda)^2 between eigenvalues of a block."""
+    once = 1 / (mu[..., None] * nu + lam)
     twice = np.square(once)
     if power == 0:
-        one = (once * (weights * nu)) @ twice.T
-        return np.asarray(-(one + one.T))
+        one = (once * (weights * nu)) @ twice.mT
+        return np.asarray(-(one + one.mT))
+    scaled = mu[..., None] * twice
     if power == 1:
-        scaled = mu[:, None] * twice
-        return np.asarray(lam**2 * (twice * weights) @ twice.T - (scaled * (weights * np.square(nu))) @ scaled.T)
-    one = mu[:, None] * ((twice * weights) @ twice.T)
-    scaled = mu[:, None] * twice
-    return np.asarray(lam * (2 * (scaled * (weights * nu)) @ scaled.T + lam * (one + one.T)))
+        return np.asarray(lam**2 * (twice * weights) @ twice.mT - (scaled * (weights * np.square(nu))) @ scaled.mT)
+    one = mu[..., None] * ((twice * weights) @ twice.mT)
+    return np.asarray(lam * (2 * (scaled * (weights * nu)) @ scaled.mT + lam * (one + one.mT)))

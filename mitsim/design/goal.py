@@ -6,12 +6,13 @@ import math
 import os
 import re
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
 from mitsim.core.configuration import FilePath, Options, read_toml, refuse_together, validated_by
 from mitsim.core.errors import ArgumentError, MitsimError
+from mitsim.core.picture_files import picture_files
 from mitsim.devices.patterns import is_own
 
 Positive = Annotated[float, Field(ge=1e-6, le=1e6)]
@@ -60,7 +61,7 @@ class Goal(Options):
     scene_distances_mm: tuple[Positive, ...] = Field(default=(), strict=False)
     """Distances of the scene at which masks are judged; none: the aligned plane."""
     judge: Literal["mean", "worst"] = "mean"
-    """Mean error in dB over doses and distances, or the worst."""
+    """Mean error over doses, distances and pictures, or the worst."""
     feature_um: tuple[Positive, ...] = Field(default=(60.0,), strict=False, min_length=1)
     """Feature sizes to choose from."""
     mask_distance_mm: tuple[Positive, ...] = Field(default=(), strict=False)
@@ -69,6 +70,8 @@ class Goal(Options):
     """Least and largest fraction of a side's features that are open."""
     prior: tuple[Positive, Part, Annotated[float, Field(ge=0, lt=1)]] | None = Field(default=None, strict=False)
     """Reflectance: mean, standard deviation, correlation of neighbouring pixels; none: those of the scene."""
+    pictures: FilePath | None = None
+    """Folder whose pictures replace that of the scene in turn."""
     wanted_psnr_db: float | None = Field(default=None, ge=1, le=100)
     """Also state the exposure that this PSNR needs."""
     starts: int = Field(default=4, ge=1, le=10_000)
@@ -89,6 +92,11 @@ class Goal(Options):
         """Pattern families with which the search begins: dots:P for cyclic:P."""
         return tuple(dict.fromkeys(re.sub("^cyclic:", "dots:", name) for name in self.patterns))
 
+    @property
+    def shown(self) -> list[dict[str, Any]]:
+        """Parameters of the scene for each picture."""
+        return [{}] if self.pictures is None else [{"picture": each} for each in picture_files(Path(self.pictures))]
+
     def check_count(self) -> None:
         """Raise MitsimError for too many combinations."""
         for names in (("feature_um", "mask_distance_mm", "patterns"), ("doses", "scene_distances_mm")):
@@ -105,8 +113,8 @@ def load_goal(path: Path | str) -> Goal:
         raise refuse_together(f"file {path}", [*texts]) from error
     patterns = (os.path.normpath(base / each) if is_own(each, base) else each for each in goal.patterns)
     update: dict[str, object] = {"patterns": tuple(patterns)}
-    for name in ("scene", "camera"):
+    for name in ("scene", "camera", "pictures"):
         text = str(getattr(goal, name))
-        if os.sep in text or Path(text).suffix:
+        if os.sep in text or Path(text).suffix or (name == "pictures" and goal.pictures):
             update[name] = os.path.normpath(base / text)
     return goal.model_copy(update=update)

@@ -6,7 +6,7 @@ import itertools
 import math
 import re
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import astuple, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -16,8 +16,9 @@ import tomli_w
 from pydantic import Field
 from scipy.optimize import brentq
 
+from mitsim.acquire.exposure import ambient_shots
 from mitsim.bench.apparatus import Apparatus
-from mitsim.bench.layout import before_board
+from mitsim.bench.request import PredictRequest
 from mitsim.calibrate.board_session import Session
 from mitsim.core.arrays import FloatArray
 from mitsim.core.configuration import Configuration, validate
@@ -29,7 +30,7 @@ from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.seeds import stream
 from mitsim.design.goal import Goal
 from mitsim.design.objective import CodedSide, Light, Objective, Prior, cyclic_patterns
-from mitsim.design.predict import Stand, TracedLight
+from mitsim.design.predict import CELLS, Stand, scenes_of
 from mitsim.design.search import Found, Search
 from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.patterns import PatternFamily, short_name
@@ -80,7 +81,10 @@ class Candidate:
     name: str
     choice: Choice
     found: Found
-    exposure_total_s: float
+    exposures: tuple[float, ...]
+    """Seconds of all frames, for each dose."""
+    cases: tuple[Mapping[str, Any], ...] = ()
+    """Predicted and rendered PSNR [dB] of each picture and dose."""
     predicted: float = math.nan
     causes: Mapping[str, float] = field(default_factory=dict)
     rendered: float = math.nan
@@ -91,21 +95,17 @@ class Candidate:
 
     def payload(self) -> dict[str, Any]:
         return {
-            "name": self.name,
+            **{name: getattr(self, name) for name in ("name", "cases", "causes", "warnings")},
+            **{f"psnr_{name}": getattr(self, name) for name in ("predicted", "rendered", "scatter")},
             "feature_um": self.choice.feature_mm * 1e3,
             "mask_distance_mm": self.choice.distance_mm,
             "patterns": self.choice.shown,
             "origin": self.found.origin,
             "code": _text(self.found.code),
             "evaluations": self.found.evaluations,
-            "exposure_total_s": self.exposure_total_s,
+            "exposure_total_s": self.exposures[0],
             "psnr_of_search": self.found.psnr_db,
-            "psnr_predicted": self.predicted,
-            "causes": self.causes,
-            "psnr_rendered": self.rendered,
-            "psnr_scatter": self.scatter,
             "session_exposure_s": self.session_s,
-            "warnings": self.warnings,
         }
 
 
@@ -118,27 +118,26 @@ def _camera(bench: Apparatus, **update: Any) -> CameraGeometry:
     return validate(CameraGeometry, {**dict(bench.geometry), **bare}, "goal")
 
 
-def stand_of(bench: Apparatus, seed: int) -> tuple[Stand, float]:
-    """Trace the light of a scene and of its white board, and return them with the session's exposure time [s].
-
-    The bench, which may have any mask, gets a thin separable one.
-    """
+def stand_of(bench: Apparatus, seed: int) -> Stand:
+    """Trace the light of a scene and of its white board; the bench, of any mask, gets a thin separable one."""
     bench.loaded.camera.wear(_camera(bench))
-    bench, recipe = replace(bench, devices=replace(bench.devices, camera=_camera(bench))), load_recipe().of_one_depth()
-    board = TracedLight.of(before_board(bench, recipe.board_reflectance), seed)
-    stand = Stand(bench, TracedLight.of(bench, seed), board)
+    bench = replace(bench, devices=replace(bench.devices, camera=_camera(bench)))
+    stand = Stand.of(Session(bench, load_recipe(), seed))
     if not (stand.unit > 0 and stand.truth.any()):
         problem = f"scene {bench.loaded.path}: no light of the projector comes from it to the camera"
         raise MitsimError(f"{problem}, so that no mask is better than another; give another scene")
-    return stand, stand.session_noise(Session(bench, recipe, seed))[1]
+    return stand
 
 
 @single_threaded_blas()
-def objectives(stand: Stand, goal: Goal, choice: Choice, session_s: float) -> list[Objective]:
+def objectives(stand: Stand, goal: Goal, choice: Choice) -> list[Objective]:
     """Return the objectives of a ``choice``, one for each dose and distance."""
     bench, sensor = stand.bench, stand.bench.sensor
-    family, prior = choice.family(bench), prior_of(stand, goal)
-    scenes = [stand.truth] if goal.prior is None else prior.draw(stand.truth.shape, goal.seed)
+    family = choice.family(bench)
+    scenes = [each.pixels(CELLS) for _, each in scenes_of(PredictRequest(pictures=goal.pictures), stand)]
+    judged = [[each] for each in scenes] if goal.judge == "worst" else [scenes]
+    if goal.prior is not None:
+        judged = [Prior(*goal.prior).draw(stand.truth.shape, goal.seed)]
     if family.signed:
         problem = f"patterns: got {choice.patterns!r}, which are differences of two frames, and a search knows single"
         raise MitsimError(f"goal: {problem} ones; give uniform, dots:K, random:K or own patterns")
@@ -150,6 +149,7 @@ def objectives(stand: Stand, goal: Goal, choice: Choice, session_s: float) -> li
     if choice.feature_mm < narrowest:
         problem = f"feature_um: got {choice.feature_mm * 1e3:g}, too narrow for the model of diffraction"
         raise MitsimError(f"goal: {problem}; give at least {narrowest * 1e3:.3g}")
+    lamps, shots = _lamps(stand), 0 if stand.ambient is None else ambient_shots(family)
     depths, found = goal.scene_distances_mm or (bench.geometry.scene_distance,), list[Objective]()
     update: dict[str, Any] = {"mask_feature": choice.feature_mm, "mask_distance": choice.distance_mm}
     camera = _camera(bench, **update, scene_distance=min(depths))
@@ -158,40 +158,49 @@ def objectives(stand: Stand, goal: Goal, choice: Choice, session_s: float) -> li
     for depth in depths:
         camera = _camera(bench, **update, scene_distance=depth)
         directions = [Directions.cells(np.linspace(*window, bench.n + 1)) for window in bench.windows_at(depth)]
-        rows = CodedSide(camera, 0, directions[0], features, shown[0], bench.waves)
+        rows = CodedSide(camera, 0, directions[0], features, shown[0], bench.waves, lamps[0])
         near = np.allclose(directions[0].centres, directions[1].centres, rtol=0, atol=_ALIKE * directions[0].width)
-        alike = camera.axes_alike and near and np.array_equal(shown[0], shown[1])
-        columns = rows if alike else CodedSide(camera, 1, directions[1], features, shown[1], bench.waves)
+        alike = camera.axes_alike and near and np.array_equal(shown[0], shown[1]) and not shots
+        columns = rows if alike else CodedSide(camera, 1, directions[1], features, shown[1], bench.waves, lamps[1])
         for dose in goal.doses:
             light = Light(
                 gain=stand.unit * (bench.geometry.scene_distance / depth) ** 2,
                 frame_s=goal.exposure_total_s * dose / len(family.shots),
-                session_frame_s=session_s,
+                session_e=load_recipe().exposure_fraction * sensor.superpixel_full_well_e,
                 read_noise_e=sensor.superpixel_read_noise_e,
                 dark_e_per_s=sensor.superpixel_dark_current_e_per_s,
                 most_e=_FULL * sensor.superpixel_full_well_e,
+                ambient_shots=shots,
             )
-            found.append(Objective((rows, columns), light, prior, scenes))
+            found += [Objective((rows, columns), light, prior_of(each, goal), each) for each in judged]
     if goal.exposures == "light":
         code = Search(found).maximum_length().code
         found = [each.of_equal_light((code, code)) for each in found]
     return found
 
 
-def prior_of(stand: Stand, goal: Goal) -> Prior:
-    """Return the goal's prior, or mean, deviation and correlation of the scene's apparent reflectance."""
+def _lamps(stand: Stand) -> list[list[tuple[Directions, FloatArray]]]:
+    """Return the directions of ambient light along both axes, with margins that are relative to a white pixel."""
+    grids, every, last = stand.scene.simulation.grids, stand.scene.estimate.light.items(), [stand.bench.n**2]
+    lit = [(grids[name].bundle, light[last].toarray()) for name, light in every if stand.ambient is not None]
+    scale = (sum(light.sum() for _, light in lit) * stand.board.pixels.mean()) ** -0.5 if lit else 0.0
+    margins = [[light.reshape(each.cells).sum(axis=1 - k) * scale for each, light in lit] for k in (0, 1)]
+    return [
+        [(each.directions[k], at) for (each, _), at in zip(lit, margins[k], strict=True) if at.any()] for k in (0, 1)
+    ]
+
+
+def prior_of(scenes: Sequence[FloatArray], goal: Goal) -> Prior:
+    """Return the goal's prior, or mean, deviation and correlation of the apparent reflectance of scenes."""
     if goal.prior is not None:
         return Prior(*goal.prior)
-    truth = stand.truth
-    off, variance = truth - truth.mean(), float(truth.var())
+    mean = float(np.mean(scenes))
+    off = np.stack(scenes) - mean
+    variance = float(np.square(off).mean())
     if not variance:
-        return Prior(float(truth.mean()), 0.0, 0.5)
-    neighbours = (off[1:] * off[:-1]).mean(), (off[:, 1:] * off[:, :-1]).mean()
-    return Prior(float(truth.mean()), variance**0.5, float(np.clip(np.mean(neighbours) / variance, 0.0, 0.999)))
-
-
-def search_of(stand: Stand, goal: Goal, choice: Choice, session_s: float) -> Search:
-    return Search(objectives(stand, goal, choice, session_s), goal.open_part, goal.judge == "worst", goal.seed)
+        return Prior(mean, 0.0, 0.5)
+    neighbours = (off[:, 1:] * off[:, :-1]).mean(), (off[:, :, 1:] * off[:, :, :-1]).mean()
+    return Prior(mean, variance**0.5, float(np.clip(np.mean(neighbours) / variance, 0.0, 0.999)))
 
 
 class _Start(Configuration):
@@ -208,18 +217,17 @@ class _State(Configuration):
     starts: dict[str, list[_Start]] = Field(default_factory=dict)
 
 
-def searches(stand: Stand, goal: Goal, session_s: float) -> dict[Choice, Search]:
+def searches(stand: Stand, goal: Goal) -> dict[Choice, Search]:
     """Return each choice of feature size, distance and family with its search."""
     distances = goal.mask_distance_mm or (stand.bench.geometry.mask_distance,)
     options = itertools.product(goal.feature_um, distances, goal.families)
     order = [Choice(feature * 1e-3, distance, patterns) for feature, distance, patterns in options]
-    return {choice: search_of(stand, goal, choice, session_s) for choice in order}
+    known = goal.open_part, goal.judge == "worst", goal.seed
+    return {choice: Search(objectives(stand, goal, choice), *known) for choice in order}
 
 
 @single_threaded_blas()
-def run_search(
-    stand: Stand, goal: Goal, folder: Path, job: Job, session_s: float, every: dict[Choice, Search]
-) -> tuple[list[Candidate], bool]:
+def run_search(goal: Goal, folder: Path, job: Job, every: dict[Choice, Search]) -> tuple[list[Candidate], bool]:
     """Return the best masks: the found one, then simple ones; and whether all starts were made; add to ``every``.
 
     Starts that are done are in ``search.json``, from which a search that was stopped goes on. For cyclic patterns,
@@ -265,7 +273,7 @@ def run_search(
             changed = replace(choice, patterns=cyclic, lit=lit)
             if lit.count("1") > 1 and changed not in every:  # a single 1 is dots
                 order.append(changed)
-                every[changed] = search_of(stand, goal, changed, session_s)
+                every[changed] = search.lit_by(lit)
                 known_masks[changed] = [(f"the mask for {choice.shown}", mask.code)]
                 keep("design", changed, replace(mask, score=every[changed].score(mask.code).score), every[changed])
         keep("random", choice, search.best_random(spent), search)
@@ -275,9 +283,11 @@ def run_search(
         del best[FOR_DOTS]
     candidates = []
     for name, (choice, found, search) in best.items():
-        objective = search.objectives[0]
-        longer = objective.frame_s((found.code, found.code)) / objective.light.frame_s
-        candidates.append(Candidate(name, choice, found, goal.exposure_total_s * longer))
+        each = len(search.objectives) // max(len(goal.scene_distances_mm), 1) // len(goal.doses)  # pictures
+        longer = [one.frame_s((found.code, found.code)) / one.light.frame_s for one in search.objectives]
+        parts = (min(longer[k * each : (k + 1) * each]) for k in range(len(goal.doses)))
+        exposures = tuple(goal.exposure_total_s * dose * part for dose, part in zip(goal.doses, parts, strict=True))
+        candidates.append(Candidate(name, choice, found, exposures))
     return candidates, complete
 
 
@@ -324,10 +334,8 @@ def sensitivity(search: Search, code: FloatArray) -> dict[str, float]:
     here, random = search.score(code).score, stream(search.seed, "flaws")
     worse = []
     for _ in range(8):
-        made = code.copy()
         places = random.choice(search.used, max(round(len(search.used) / 100), 1), replace=False)
-        made[places] = 1 - made[places]
-        worse.append(search.score(made).score)
+        worse.append(search.score(np.abs(code - np.isin(np.arange(len(code)), places))).score)
     flaws, dark = float(np.mean(worse)) / here, _score(search, code, 0.1) / here
     losses = {"one feature in a hundred wrong": flaws, "a tenth of the light": dark}
     return {name: -10 * math.log10(loss) for name, loss in losses.items()}
@@ -335,9 +343,7 @@ def sensitivity(search: Search, code: FloatArray) -> dict[str, float]:
 
 def _score(search: Search, code: FloatArray, longer: float) -> float:
     """Return the score of a code for exposures that are ``longer`` by a factor."""
-    changed = [
-        replace(each, light=replace(each.light, frame_s=each.light.frame_s * longer)) for each in search.objectives
-    ]
+    changed = [replace(one, light=replace(one.light, frame_s=one.light.frame_s * longer)) for one in search.objectives]
     return Search(changed, search.open_part, search.worst, search.seed).score(code).score
 
 

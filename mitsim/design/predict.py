@@ -11,13 +11,12 @@ from typing import Any
 import numpy as np
 from scipy import sparse
 
-from mitsim.acquire.exposure import ambient_shots, camera_warnings
+from mitsim.acquire.exposure import ambient_shots
 from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.effects import EFFECTS
 from mitsim.bench.layout import before_board
 from mitsim.bench.request import Exposure, PredictRequest
-from mitsim.calibrate.board_session import Session, response_variances
-from mitsim.calibrate.session_plan import vector_variance
+from mitsim.calibrate.board_session import Session, entry_variances
 from mitsim.core.arrays import FloatArray
 from mitsim.core.images import fit_square, read_reflectance
 from mitsim.core.job import Job
@@ -110,6 +109,12 @@ class Stand:
     board: TracedLight
     waves: bool = True
 
+    @classmethod
+    def of(cls, session: Session) -> Stand:
+        """Trace the light of a ``session``'s bench and of its white board."""
+        board = before_board(session.bench, session.recipe.board_reflectance)
+        return cls(session.bench, TracedLight.of(session.bench, session.seed), TracedLight.of(board, session.seed))
+
     @cached_property
     def unit(self) -> float:
         return self._rate(float(self.board.pixels.mean()))
@@ -179,40 +184,56 @@ class Stand:
                     total[np.ix_(rows, columns)] += first @ image @ second.T
         return total
 
+    @cached_property
+    def white(self) -> FloatArray:
+        """Return the light of a white board, of which all pixels are lit (m, m') [electrons / s]."""
+        terms = self.camera.pixel_terms
+        return np.asarray(sum(np.outer(left.sum(axis=1), right.sum(axis=1)) for left, right in terms))
+
     def session_noise(self, session: Session) -> tuple[tuple[float, float], float]:
         """Return the deviations of the factors' numbers by the noise of a ``session``, and its exposure time [s]."""
-        pixels = self.camera.pixel_terms
-        white = np.asarray(sum(np.outer(left.sum(axis=1), right.sum(axis=1)) for left, right in pixels))
         timing = Exposure(None, session.recipe.exposure_fraction)
-        seconds = timing.choose(self.bench.devices, float(white.max()) / self._rate(1.0))
-        own, _ = response_variances(session, white, seconds)
-        variance, count = np.broadcast_to(sum(own.values(), np.zeros(1)), white.shape), session.signs.shape[1]
+        seconds = timing.choose(self.bench.devices, float(self.white.max()) / self._rate(1.0))
         left, right = (
-            float(np.sqrt(vector_variance(each, other.sum(axis=1)).mean() / count))
-            for each, other in zip((variance, variance.T), self.camera.factors[::-1], strict=True)
+            float(np.sqrt(sum(each.values(), np.zeros(1)).mean()))
+            for each in entry_variances(session, self.white, seconds, self.camera.factors)
         )
         return (left, right), seconds
 
+    @cached_property
+    def own(self) -> Scene:
+        """Return the scene in front of the camera, as it was traced."""
+        return Scene(_over(self.scene.cells, self.board.cells), beyond=self.scene.beyond)
+
     def predictor(self, scene: Scene, family: PatternFamily, session: Session, asked: PredictRequest) -> Predictor:
         """Return the predictor of a ``scene`` under a ``family``, exposed as it is ``asked``."""
-        sensor, ambient = self.bench.sensor, self.ambient
+        ambient = self.ambient
         shown = family.left.astype(np.float64), family.right.astype(np.float64)
         peak = self.camera.brightest(scene, shown, 0.0 if ambient is None else ambient)
         timing = asked.timing
         if asked.exposure_total is not None:
             timing = Exposure(asked.exposure_total / len(family.shots))
         exposure_s = timing.choose(self.bench.devices, peak / self._rate(1.0))
-        dark, digital = sensor.superpixel_dark_current_e_per_s, digital_of(sensor, exposure_s)
-        noise = Noise(
-            seconds=exposure_s,
-            dark=dark,
-            read=float(digital.variance(0.0)) * exposure_s**2 - dark * exposure_s,
-            uneven=response_variance(sensor) + self.bench.speckle(family) ** 2,
-            factors=self.session_noise(session)[0],
-            ambient=ambient,
-            ambient_shots=0 if ambient is None or family.signed else ambient_shots(family),
-        )
-        return Predictor(self.camera, shown, scene, noise)
+        noise = noise_of(self.bench, family, exposure_s, self.session_noise(session)[0], ambient)
+        model = Predictor(self.camera, shown, scene, noise)
+        model.seen = self.seen(model, family) if scene is self.own else None
+        return model
+
+
+def noise_of(
+    bench: Apparatus, family: PatternFamily, seconds: float, factors: tuple[float, float], ambient: FloatArray | None
+) -> Noise:
+    """Return the noise of a ``bench`` under a ``family``; ``factors`` and ``ambient`` as of :class:`Noise`."""
+    dark, digital = bench.sensor.superpixel_dark_current_e_per_s, digital_of(bench.sensor, seconds)
+    return Noise(
+        seconds=seconds,
+        dark=dark,
+        read=float(digital.variance(0.0)) * seconds**2 - dark * seconds,
+        uneven=response_variance(bench.sensor) + bench.speckle(family) ** 2,
+        factors=factors,
+        ambient=ambient,
+        ambient_shots=0 if ambient is None or family.signed else ambient_shots(family),
+    )
 
 
 def _of_kind(side: Any, factor: FloatArray, kind: FloatArray) -> tuple[Any, FloatArray]:
@@ -311,14 +332,11 @@ def predict(bench: Apparatus, asked: PredictRequest, job: Job | None = None) -> 
     family, session = bench.family(asked.patterns, asked.seed), Session(bench, recipe, asked.seed)
     session.check_mask(job)
     with job.clock.stage("transport"):
-        scene = TracedLight.of(bench, asked.seed)
-        stand = Stand(bench, scene, TracedLight.of(before_board(bench, recipe.board_reflectance), asked.seed))
+        stand = Stand.of(session)
     with job.clock.stage("predict"):
         found, lam = list[tuple[str, Predictor, Errors]](), asked.weight
-        for name, each in _scenes(asked, stand):
+        for name, each in scenes_of(asked, stand):
             model = stand.predictor(each, family, session, asked)
-            if not (name or asked.prior):
-                model.seen = stand.seen(model, family)
             found.append((name, model, model.errors(lam)))
         _, model, errors = found[0]
         mean = {cause: float(np.mean([each.causes[cause] for *_, each in found])) for cause in errors.causes}
@@ -337,11 +355,12 @@ def predict(bench: Apparatus, asked: PredictRequest, job: Job | None = None) -> 
         electrons=float(model.light[0].mean()) * model.noise.seconds / (2 if family.signed else 1),
         session_exposure_s=stand.session_noise(session)[1],
         without_diffraction_db=without,
-        warnings=tuple(_lacks(stand, model, session, lam is not None)),
+        warnings=tuple(lacks(stand, model, session, lam is not None)),
     )
 
 
-def _scenes(asked: PredictRequest, stand: Stand) -> Iterator[tuple[str, Scene]]:
+def scenes_of(asked: PredictRequest, stand: Stand) -> Iterator[tuple[str, Scene]]:
+    """Yield names and scenes: the prior's, those of pictures, or the bench's own."""
     side = CELLS * stand.bench.n
     if asked.prior is not None:
         mean, variance, length = asked.prior
@@ -355,16 +374,15 @@ def _scenes(asked: PredictRequest, stand: Stand) -> Iterator[tuple[str, Scene]]:
             weights = np.diff(below, axis=1) * side / len(square)
             yield path.name, Scene(weights @ square @ weights.T)
     else:
-        yield "", Scene(_over(stand.scene.cells, stand.board.cells), beyond=stand.scene.beyond)
+        yield "", stand.own
 
 
-def _lacks(stand: Stand, model: Predictor, session: Session, asked_lambda: bool) -> Iterator[str]:
+def lacks(stand: Stand, model: Predictor, session: Session, asked_lambda: bool = False) -> Iterator[str]:
     """Yield the causes that the prediction lacks, with their size."""
     bench, scene, energy = stand.bench, stand.scene, float(np.square(stand.truth).mean())
-    yield from session.mask_warnings
+    yield from session.warnings
     if model.prepared.spare <= 0 and not asked_lambda:
         yield "too few data: a solver cannot estimate noise and choose lambda from these frames; take more patterns"
-    yield from camera_warnings(bench.sensor, bench.geometry.frame_shape)
     if model.seen is None and scene.beyond > _SMALL:
         size = f"{scene.beyond:.1%} of the direct light, an error of {decibels(scene.beyond**2 * energy):.1f} dB alone"
         yield f"indirect light: light over several surfaces is {size}, and this prediction lacks it"

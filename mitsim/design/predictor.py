@@ -21,6 +21,7 @@ S[k, l] A_R[b, l] B_R[b, l]. Each cause has half of its cross terms with others,
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
@@ -91,19 +92,20 @@ class Camera:
     def brightest(self, scene: Scene, patterns: Pair, ambient: FloatArray | float = 0.0) -> float:
         """Return the light of the brightest pixel of all shots [electrons / s]."""
         pixels, signed = (1 + scene.beyond) * scene.pixels(self.cells), any((side < 0).any() for side in patterns)
-
-        def frame(rows: FloatArray, columns: FloatArray) -> FloatArray:
-            lit = np.flatnonzero(rows), np.flatnonzero(columns)
-            seen = pixels[np.ix_(*lit)] * np.outer(rows[lit[0]], columns[lit[1]])
-            return sum((a[:, lit[0]] @ seen @ b[:, lit[1]].T for a, b in self.pixel_terms), np.zeros((1, 1)))
-
-        dark = frame(*(np.ones(len(side)) for side in patterns))
+        dark = seen_frame(self.pixel_terms, pixels)
         leaking, most = self.leak * dark + ambient, 0.0
         for rows, columns in product(patterns[0].T.astype(np.float64), patterns[1].T.astype(np.float64)):
-            shown = frame(rows, columns)
+            shown = seen_frame(self.pixel_terms, pixels * np.outer(rows, columns))
             shots = ((dark + shown) / 2, (dark - shown) / 2) if signed else (shown,)
             most = max(most, *(float((shot + leaking).max()) for shot in shots))
         return most
+
+
+def seen_frame(terms: Sequence[SeparableTerm], light: FloatArray) -> FloatArray:
+    """Return the frame (m, m') of the ``light`` of scene pixels (n, n') through ``terms``."""
+    rows, columns = np.flatnonzero(light.any(axis=1)), np.flatnonzero(light.any(axis=0))
+    lit = light[np.ix_(rows, columns)]
+    return sum((left[:, rows] @ lit @ right[:, columns].T for left, right in terms), np.zeros((1, 1)))
 
 
 @dataclass(frozen=True)
@@ -148,6 +150,11 @@ class Errors:
     def psnr_db(self) -> float:
         return decibels(self.total)
 
+    @property
+    def largest(self) -> str:
+        """Return the largest cause in words."""
+        return max(self.causes, key=lambda name: self.causes[name]).replace("_", " ")
+
 
 def decibels(square: float) -> float:
     """Return a mean squared error of reflectance as PSNR [dB], infinite for none."""
@@ -173,6 +180,15 @@ class Predictor:
         # Both shots of a signed pattern light every pixel once.
         self._lighting = [np.ones_like(side) if self.signed else side for side in self.patterns]
 
+    def calibrated(self, factors: tuple[float, float]) -> Predictor:
+        """Return the predictor with other deviations of the factors; what does not depend on them is shared."""
+        _ = self._moments  # shared from now on
+        other = copy(self)
+        other.noise = replace(self.noise, factors=factors)
+        for name in ("lambdas", "_variances"):
+            vars(other).pop(name, None)
+        return other
+
     def errors(self, lam: float | None = None) -> Errors:
         """Return the errors at ``lam``; None for the lambda that the solver chooses by itself."""
         lam = self.automatic if lam is None else lam
@@ -180,6 +196,24 @@ class Predictor:
         # Nothing shows the part of the scene beyond the basis.
         causes[REGULARISATION] += max(self._energy - float(self._moments[0, 0].sum()), 0.0) / self.prepared.unknowns
         return Errors(causes, lam)
+
+    def session_scatter(self, lam: float) -> float:
+        """Return the standard deviation of the squared error between sessions, relative to its mean.
+
+        A session adds normal errors x of covariance C to the errors e of other causes, whose signs are taken as random.
+        The sum of squares of e + x then has the variance 2 tr C^2 + 4 sum_i C_ii e_i^2 (Searle, Linear Models, 1971,
+        section 2.5). Noise of a factor is correlated only between coefficients of one row, or of one column.
+        """
+        square, variance, errors = np.square(self.prepared.gain(lam)), 0.0, self._by_coefficient(lam)
+        for axis, weights in enumerate((square, square.T)):
+            variances, data = self._factor_data(axis)
+            light = self._mean_of(data) if axis == 0 else self._mean_of(data).T
+            for own, weight in zip(variances, weights, strict=True):
+                variance += 2 * float(own @ np.square((light * weight) @ light.T) @ own)
+        both = np.square(square) * self._of_factor(0) * self._of_factor(1).T
+        others = np.sum([each for name, each in errors.items() if name != SESSION], axis=0)
+        variance += 4 * float(np.sum(both + errors[SESSION] * others))
+        return float(np.sqrt(variance)) / self.prepared.unknowns / self.errors(lam).total
 
     @property
     def automatic(self) -> float:
@@ -212,19 +246,15 @@ class Predictor:
 
             def risk(lam: float) -> float:
                 errors = np.square(lam / (np.square(sigma) + lam)) * moments[0, 0] if lam else np.zeros_like(sigma)
-                return float(np.vdot(weights, errors + np.square(self._gain(lam)) * noise))
+                return float(np.vdot(weights, errors + np.square(self.prepared.gain(lam)) * noise))
 
             return max(best_lambda(risk, scale), least)
 
         every = best(last=3)
         return (every if self.seen is None else best(last=2)), every
 
-    def _gain(self, lam: float) -> FloatArray:
-        sigma = self.prepared.sigma
-        return np.divide(sigma, np.square(sigma) + lam, out=np.zeros_like(sigma), where=sigma > 0)
-
     def _by_coefficient(self, lam: float) -> dict[str, FloatArray]:
-        sigma, gain = self.prepared.sigma, self._gain(lam)
+        sigma, gain = self.prepared.sigma, self.prepared.gain(lam)
         kept, zero, square = gain * sigma, np.zeros_like(sigma), np.square(gain)
         found = {name: square * variance for name, variance in self._variances.items()}
         # By cause the weights of pixels, fine, full, seen and black, whose sum is the error of the whole.
@@ -325,12 +355,16 @@ class Predictor:
 
     def _of_factor(self, axis: int) -> FloatArray:
         """Return the variance (r, r') of W by independent noise of a factor, sum_p rho[a, p] (X V S)[p, b]^2."""
+        variances, data = self._factor_data(axis)
+        seen = self._expected(data, data)
+        return variances @ (seen if axis == 0 else seen.T)
+
+    def _factor_data(self, axis: int) -> tuple[FloatArray, Sequence[Pair]]:
+        """Return the variances s^2 rho (r, n) of a factor's noise, and the operator of its light X V S (n, r')."""
         own, other = self._sides[axis], self._sides[1 - axis]
         responses, of_kind = kind_responses(own, self.patterns[axis])
         through = self._in_cells(np.eye(own.scene_size)), self._in_cells(other.response.T)
-        data = [through if axis == 0 else through[::-1]]
-        seen = self._expected(data, data)
-        return self.noise.factors[axis] ** 2 * responses @ of_kind @ (seen if axis == 0 else seen.T)
+        return self.noise.factors[axis] ** 2 * responses @ of_kind, [through if axis == 0 else through[::-1]]
 
     @property
     def _energy(self) -> float:

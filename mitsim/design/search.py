@@ -101,26 +101,22 @@ class Search:
         if (best := self.best_pinholes()) is not None:
             yield best.origin, best.code
         while True:
-            random, code = stream(self.seed, "mask search", number), np.zeros(self.features)
-            part = _PARTS[number // 2 % len(_PARTS)]
+            random, part = stream(self.seed, "mask search", number), _PARTS[number // 2 % len(_PARTS)]
             if number % 2:
                 period = int(random.integers(3, max(len(self.used) // 3, 4)))
                 width = int(random.integers(1, max(period // 3, 1) + 1))
-                code[self.used] = pinholes(len(self.used), period, width)
+                code = self._placed(pinholes(len(self.used), period, width))
                 yield f"pinholes of period {period}, width {width}, start {number}", code
             else:
-                code[self.used] = random.random(len(self.used)) * 2 * part
-                yield f"random transmissions, start {number}", code
+                yield f"random transmissions, start {number}", self._placed(random.random(len(self.used)) * 2 * part)
             number += 1
 
     def improve(self, origin: str, start: FloatArray, evaluations: int = 400) -> Found:
         """Return the best code near a ``start``, after at most about that many evaluations."""
         begun = self.evaluations
-        code = (
-            start
-            if set(np.unique(start)) <= {0.0, 1.0} and self.allows(start)
-            else self._round(self._relax(start, evaluations // 2))
-        )
+        code = start
+        if not (set(np.unique(start)) <= {0.0, 1.0} and self.allows(start)):
+            code = self._round(self._relax(start, evaluations // 2))
         here = self.score(code, slopes=True)
         while self.evaluations - begun < evaluations:
             change = (here.slope * (1 - 2 * code))[self.used]
@@ -139,16 +135,15 @@ class Search:
 
     def best_random(self, evaluations: int) -> Found:
         """Return the best of that many random codes."""
-        random, best, begun = stream(self.seed, "random masks"), None, self.evaluations
-        while self.evaluations - begun < evaluations or best is None:
-            part, code = _PARTS[(self.evaluations - begun) % len(_PARTS)], np.zeros(self.features)
-            code[self.used] = random.random(len(self.used)) < part
+        random, found = stream(self.seed, "random masks"), list[Found]()
+        while len(found) < max(evaluations, 1):
+            part = _PARTS[len(found) % len(_PARTS)]
+            code = self._placed(np.where(random.random(len(self.used)) < part, 1.0, 0.0))
             if not self.allows(code):
                 code = self._bounded(code, random.random(self.features))
-            score = self.score(code).score
-            if best is None or score < best.score:
-                best = Found(f"random, open part {code[self.used].mean():.2f}", code, score, 0)
-        return Found(best.origin, best.code, best.score, self.evaluations - begun)
+            origin, score = f"random, open part {code[self.used].mean():.2f}", self.score(code).score
+            found.append(Found(origin, code, score, evaluations))
+        return min(found, key=lambda each: each.score)
 
     def lit_by(self, lit: str) -> Search:
         """Return the search for cyclic patterns of a code."""
@@ -163,8 +158,7 @@ class Search:
         found, begun = [], self.evaluations
         for period in range(2, len(self.used) // 2):
             for width in range(1, min(period // 2, _WIDEST) + 1):
-                code = np.zeros(self.features)
-                code[self.used] = pinholes(len(self.used), period, width)
+                code = self._placed(pinholes(len(self.used), period, width))
                 if self.allows(code):
                     score = self.score(code).score
                     found.append(Found(f"pinholes of period {period}, width {width}", code, score, 0))
@@ -185,22 +179,22 @@ class Search:
 
     def active_bounds(self, code: FloatArray) -> list[str]:
         """Return the bounds that a code has reached."""
-        count = code[self.used].sum()
         both = (self._fewest, "smallest open_part"), (self._most, "largest open_part")
-        return [name for bound, name in both if count == bound]
+        return [name for bound, name in both if code[self.used].sum() == bound]
 
     def _relax(self, start: FloatArray, evaluations: int) -> FloatArray:
         def cost(inside: FloatArray) -> tuple[float, FloatArray]:
-            code = np.zeros(self.features)
-            code[self.used] = inside
-            found = self.score(code, slopes=True)
+            found = self.score(self._placed(inside), slopes=True)
             return math.log(found.score), found.slope[self.used]
 
         options = {"maxiter": _RELAXED, "maxfun": evaluations}
         bounds = [(0.0, 1.0)] * len(self.used)
         found = minimize(cost, start[self.used], jac=True, method="L-BFGS-B", bounds=bounds, options=options)
+        return self._placed(found.x)
+
+    def _placed(self, inside: FloatArray) -> FloatArray:
         code = np.zeros(self.features)
-        code[self.used] = found.x
+        code[self.used] = inside
         return code
 
     def _round(self, code: FloatArray) -> FloatArray:

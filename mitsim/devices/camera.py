@@ -20,7 +20,7 @@ from mitsim.core.arrays import FloatArray
 from mitsim.core.configuration import Configuration, read_toml, validate
 from mitsim.core.errors import MitsimError
 from mitsim.core.files import FRAME_LIMITS, fits_a_frame
-from mitsim.core.images import image_pages, own_end, read_image
+from mitsim.core.images import image_pages, own_end, read_image, reduce_frame
 from mitsim.core.job import Cost, Limits
 from mitsim.core.picture_files import BGGR, PLANES, Wanted, planes_of
 from mitsim.core.seeds import stream
@@ -584,8 +584,7 @@ def _light(path: Path, values: FloatArray, reduce: int) -> FloatArray:
     inside = np.zeros(values.shape, dtype=bool)
     inside[PSF_BORDER:-PSF_BORDER, PSF_BORDER:-PSF_BORDER] = True
     above = values - np.median(values[~inside])
-    means = above[: rows * reduce, : columns * reduce].reshape(rows, reduce, columns, reduce).mean(axis=(1, 3))
-    light = np.maximum(means, 0)
+    light = np.maximum(reduce_frame(above, reduce), 0)
     if light.sum() <= 0:
         raise _PICTURE.refusal(path, "nothing is brighter than its edges; give another picture")
     return np.asarray(light)

@@ -157,7 +157,11 @@ def _read(path: Path, sides: Sides, light: tuple[float, ...] | None, look: Look)
         raise MitsimError(f"patterns {path}: are all dark; light some pixels")
     left_right = next(filter(None, (_factorise(levels, shown, k) for k in rows)), None)
     if left_right is None:
-        raise MitsimError(f"patterns {path}: {_why_not(levels, shown)}")
+        lit = (k for k in range(len(levels)) if shown[levels[k]].any())
+        alone = next((k + 1 for k in lit if _factorise(levels[k : k + 1], shown, 1) is None), None)
+        which = f"pattern {alone} of {len(levels)} is no column times a row" if alone else "not all, or not in order"
+        rule = "give every pair of K left profiles and K' right ones, in the order (1, 1), (1, 2), ... (K, K')"
+        raise MitsimError(f"patterns {path}: {which}; {rule}")
     left, right = left_right
     if binary and np.isin(left, (0, 1)).all() and np.isin(right, (0, 1)).all():
         return OwnPatterns(left.astype(np.int8), right.astype(np.int8))
@@ -248,14 +252,3 @@ def _factorise(levels: Levels, light: FloatArray, rows: int) -> tuple[FloatArray
         if (product < unfolded(block, below)).any() or (product > unfolded(block, above)).any():
             return None
     return left.T, right.reshape(count // rows, -1).T
-
-
-def _why_not(levels: Levels, light: FloatArray) -> str:
-    lit = [number for number, level in enumerate(levels) if light[level].any()]
-    for number in lit:
-        if _factorise(levels[number : number + 1], light, 1) is None:
-            which = f"pattern {number + 1} of {len(levels)} is not separable"
-            return f"{which}, its light is no column times a row; no method solves such patterns, give products"
-    dark = f", and {len(levels) - len(lit)} are dark" if len(lit) < len(levels) else ""
-    pairs = "every pair of K left profiles and K' right ones, in the order (1, 1), (1, 2), ... (K, K')"
-    return f"are each separable, but not {pairs}{dark}; give these pairs in this order"

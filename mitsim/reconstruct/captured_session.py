@@ -349,7 +349,7 @@ def _sums(readings: _Readings, count: int, job: Job) -> tuple[tuple[StripeSums, 
 
         def fit_response(index: int, side: Side = side, own: StripeSums = own) -> tuple[ResponseFit, float]:
             response, variance, light = readings.response(side, index)
-            return own.fit_response(response, index, light), variance
+            return own.fit_response(response, light), variance
 
         for start in range(1, count, step):
             with job.clock.stage("frames"):

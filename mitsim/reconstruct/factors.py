@@ -110,9 +110,8 @@ class StripeSums:
         self.ambient = np.zeros((self.vectors.shape[1], 3))
         self.lights = np.zeros((len(self.vectors), 0))
 
-    def fit_response(self, response: npt.ArrayLike, number: int, light: FloatArray | None = None) -> ResponseFit:
-        across, shape, given = self.side == "horizontal", (len(self.vectors), len(self.common)), np.asarray(response)
-        response = _response(given, f"{self.side} response {number}", shape if across else shape[::-1], self.centre)
+    def fit_response(self, given: FloatArray, light: FloatArray | None = None) -> ResponseFit:
+        across, response = self.side == "horizontal", centre_frame(given) if self.centre else given
         common = self.common / np.dot(self.common, self.common)
         vector = (response if across else response.T) @ common
         rows, columns = (vector, self.common) if across else (self.common, vector)
@@ -143,23 +142,19 @@ class StripeSums:
 
 
 def stripe_sums(
-    horizontal: npt.ArrayLike,
-    vertical: npt.ArrayLike,
+    horizontal: FloatArray,
+    vertical: FloatArray,
     count: int,
     centre: bool = False,
-    uniform: npt.ArrayLike | None = None,
     lights: Sequence[FloatArray | None] = (None, None),
 ) -> tuple[StripeSums, StripeSums]:
-    first = _response(horizontal, "horizontal response 0", None, centre)
-    second = _response(vertical, "vertical response 0", first.shape, centre)
+    first, second = (centre_frame(each) if centre else each for each in (horizontal, vertical))
     mean = (upright(first, horizontal) + upright(second, vertical)) / 2
-    if uniform is not None:
-        mean = _response(uniform, "uniform response", first.shape, centre)
     a, v = _rank_one_split(mean)
     left = StripeSums("horizontal", centre, v, np.empty((len(a), count)))
     right = StripeSums("vertical", centre, a, np.empty((len(v), count)))
     for sums, response, light in zip((left, right), (horizontal, vertical), lights, strict=True):
-        sums.put(sums.fit_response(response, 0, light))
+        sums.put(sums.fit_response(response, light))
     return left, right
 
 
@@ -169,44 +164,6 @@ def upright(response: FloatArray, light: npt.ArrayLike) -> FloatArray:
 
 
 # ---- From responses, or their sums, to factors ----
-
-
-def estimate_factors(
-    horizontal: Iterable[npt.ArrayLike],
-    vertical: Iterable[npt.ArrayLike],
-    H: npt.ArrayLike,
-    centre: bool = False,
-    uniform: npt.ArrayLike | None = None,
-    noise: float | None = None,
-) -> Estimate:
-    """Estimate the factors of a separable camera from its responses to striped light.
-
-    Responses (m, m') to H[:, i] 1^T and to 1 H[:, i]^T are differences of two captures; ``H`` (n, N) has orthogonal
-    rows of +-1, and a column 0 of +1 unless the response ``uniform`` is given. ``noise`` is a response's rms. Raises
-    MitsimError for a wrong count or shape, values that are not finite, an H that is not orthogonal, or no signal.
-    """
-    signs = np.asarray(H, dtype=np.float64)
-    if signs.ndim != 2 or signs.size == 0 or not (np.abs(signs) == 1).all():
-        raise MitsimError(f"H of shape {signs.shape} is not a 2-D array of +1 and -1; use scipy.linalg.hadamard")
-    if not np.array_equal(signs @ signs.T, signs.shape[1] * np.eye(len(signs))):
-        raise MitsimError(f"rows of H, of shape {signs.shape}, are not orthogonal; use rows of a Hadamard matrix")
-    if uniform is None and not (signs[:, 0] == 1).all():
-        raise MitsimError("column 0 of H is not all +1 and no uniform response was given; give one of the two")
-    count, rests = signs.shape[1], (iter(horizontal), iter(vertical))
-
-    def following(side: str, index: int) -> npt.ArrayLike:
-        response = next(rests[side == "vertical"], None)
-        if response is None:
-            raise MitsimError(f"only {index} {side} responses were given; H has {count} columns, give one for each")
-        return response
-
-    both = stripe_sums(following("horizontal", 0), following("vertical", 0), count, centre, uniform)
-    for sums, rest in zip(both, rests, strict=True):
-        while sums.done < count:
-            sums.put(sums.fit_response(following(sums.side, sums.done), sums.done))
-        if next(rest, None) is not None:
-            raise MitsimError(f"more than {count} {sums.side} responses were given; give one for each column of H")
-    return factors_of_sums(*both, signs, noise)
 
 
 def factors_of_sums(
@@ -359,19 +316,6 @@ def _rank_one_split(mean: FloatArray) -> Pair:
         raise MitsimError("the uniform response is zero everywhere; check exposure and black level")
     root = np.sqrt(size) if left.sum() >= 0 else -np.sqrt(size)
     return left * (root / size), right * root
-
-
-# ---- Responses and patterns as they are read ----
-
-
-def _response(response: npt.ArrayLike, name: str, shape: tuple[int, ...] | None, centre: bool) -> FloatArray:
-    values = np.asarray(response, dtype=np.float64)
-    if values.ndim != 2 or values.size == 0 or (shape is not None and values.shape != shape):
-        raise MitsimError(f"{name} has shape {values.shape}; allowed is {shape or 'a 2-D array'}, as the first")
-    if not np.isfinite(values).all():
-        bad = np.count_nonzero(~np.isfinite(values))
-        raise MitsimError(f"{name} has {bad} values that are not finite; capture it again")
-    return centre_frame(values) if centre else values
 
 
 # ---- Factors of a calibrated camera ----

@@ -39,7 +39,7 @@ from mitsim.core.environment import versions
 from mitsim.core.errors import MitsimError, check_arguments
 from mitsim.core.exr import checksum, finite_channel, read_frame
 from mitsim.core.files import output_folder
-from mitsim.core.images import orient, own_end, read_image
+from mitsim.core.images import ORIENTATIONS, orient, own_end, read_image
 from mitsim.core.job import Cost, Job, Limits
 from mitsim.core.manifests import MANIFEST, CalibrationManifest, FactorNoise
 from mitsim.core.parallel import single_threaded_blas
@@ -58,17 +58,6 @@ from mitsim.reconstruct.solver import Pair, Status, Verdict, centre_columns, cen
 
 # ---- What is seen ----------------------------------------------------------------------------------------------------
 
-TURNS: dict[str, Callable[[FloatArray], FloatArray]] = {
-    "upright": lambda scene: scene,
-    "mirrored": lambda scene: scene[:, ::-1],
-    "upside down": lambda scene: scene[::-1],
-    "turned": lambda scene: scene[::-1, ::-1],
-    "transposed": lambda scene: scene.T,
-    "transposed, mirrored": lambda scene: scene.T[:, ::-1],
-    "transposed, upside down": lambda scene: scene.T[::-1],
-    "transposed, turned": lambda scene: scene.T[::-1, ::-1],
-}
-
 
 @dataclass(frozen=True, eq=False)
 class Exposure:
@@ -81,7 +70,7 @@ class Exposure:
     offset: tuple[float, float] = (0.0, 0.0)
 
     def turn_scene(self, orientation: str) -> Self:
-        return replace(self, scene=TURNS[orientation](self.scene))
+        return replace(self, scene=orient(self.scene, ORIENTATIONS[orientation]))
 
 
 def plane_offsets(how: Preparation) -> dict[str, tuple[float, float]]:
@@ -325,7 +314,7 @@ def find_pose(
 ) -> Pose:
     exposures = [replace(each, frame=centre_frame(each.frame)) for each in exposures]
     some = exposures[:: -(-len(exposures) // _COMPARED)]
-    spectra, scenes = _Spectra(some), {name: [turn(each.scene) for each in some] for name, turn in TURNS.items()}
+    spectra, scenes = _Spectra(some), {name: [each.turn_scene(name).scene for each in some] for name in ORIENTATIONS}
     ratio = some[0].frame.shape[0] / some[0].scene.shape[0]
     count = int(np.ceil(np.log(_WIDEST / _NARROWEST) / np.log(_STEP)))
     places = [(ratio * _NARROWEST * _STEP**power,) * 2 for power in range(count + 1)] if scales is None else [scales]

@@ -54,6 +54,7 @@ from scipy import fft
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import ArgumentError, MitsimError, check_arguments, cut
 from mitsim.core.headline import each_once
+from mitsim.core.images import reduce_frame
 from mitsim.core.job import Cost, Job, Limits
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.runs import Capture
@@ -217,12 +218,6 @@ class ShiftedLight:
             return [None]
         left, right = (side.T.astype(self.precision) for side in self.patterns)
         return (np.outer(row, column) for row in left for column in right)
-
-
-def reduce_frame(frame: Array, reduce: int) -> Array:
-    rows, columns = (size // reduce for size in frame.shape)
-    blocks = frame[: rows * reduce, : columns * reduce].reshape(rows, reduce, columns, reduce)
-    return np.asarray(blocks.mean(axis=(1, 3)), frame.dtype)
 
 
 # ---- The objective at one image --------------------------------------------------------------------------------------

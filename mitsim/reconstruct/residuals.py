@@ -19,7 +19,6 @@ cannot decide between them.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise, product
@@ -28,6 +27,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mitsim.core.arrays import FloatArray, sum_of_squares
+from mitsim.core.images import ORIENTATIONS, orient
 from mitsim.core.runs import Measurement
 from mitsim.devices.patterns import shot_orders
 from mitsim.reconstruct.accumulation import CHANCE, TINY, Accumulation, FrameNoise
@@ -36,17 +36,7 @@ from mitsim.reconstruct.solver import IndexArray, Pair, Prepared, group_pixels, 
 # ---- Other readings of the data -------------------------------------------------------------------------------------
 
 
-_TURNS: dict[str, Callable[[FloatArray], FloatArray]] = {
-    "as they are": lambda frame: frame,
-    "upside down, their rows reversed": lambda frame: frame[::-1],
-    "mirrored, their columns reversed": lambda frame: frame[:, ::-1],
-    "turned by 180 degrees": lambda frame: frame[::-1, ::-1],
-    "transposed, their rows and columns exchanged": lambda frame: frame.T,
-    "turned by 90 degrees counter-clockwise": lambda frame: np.rot90(frame, -1),
-    "turned by 90 degrees clockwise": lambda frame: np.rot90(frame),
-    "transposed about the other diagonal": lambda frame: frame[::-1, ::-1].T,
-}
-_KEPT, _TAKEN = "as they are", ""
+_KEPT, _TAKEN = "upright", ""
 _STEPS = {
     "late": "the frames are one step late: each shot shows the pattern of the shot before",
     "early": "the frames are one step early: each shot shows the pattern of the next",
@@ -89,7 +79,7 @@ def find_readings(data: Accumulation, ratio: float, beside: float) -> tuple[Read
         weights, energy = np.zeros_like(prepared.sigma), 0.0
         measured: dict[tuple[int, int], FloatArray] = {}
         for shot, index in zip(captures, order, strict=True):
-            own = np.ascontiguousarray(_TURNS[turn](frames[index])[part], dtype=np.float64)
+            own = np.ascontiguousarray(orient(frames[index], ORIENTATIONS[turn])[part], dtype=np.float64)
             measured[shot.row, shot.column] = measured.get((shot.row, shot.column), 0.0) + (shot.sign or 1) * own
         for pattern, frame in measured.items():
             seen = prepared.as_solved(frame)
@@ -103,7 +93,7 @@ def find_readings(data: Accumulation, ratio: float, beside: float) -> tuple[Read
     orders = {_TAKEN: taken, **shot_orders(manifest.patterns, manifest.order)}
     orders |= {"late": np.roll(taken, -1), "early": np.roll(taken, 1)}
     names = [name for name in {tuple(each): name for name, each in reversed(orders.items())}.values() if name != _TAKEN]
-    turns = [name for name, turn in _TURNS.items() if turn(np.zeros(frames[0].shape, bool)).shape == frames[0].shape]
+    turns = [name for name, turn in ORIENTATIONS.items() if orient(frames[0], turn).shape == frames[0].shape]
     size, (energy, now) = len(left) * len(right), fit(_KEPT, taken)
     noise, whole = ratio * float(data.noise.variance.sum()) * size * prepared.spare, max(energy, TINY)
     allowed = noise + beside * energy / max(float(data.frames.energy), TINY)
@@ -117,7 +107,7 @@ def find_readings(data: Accumulation, ratio: float, beside: float) -> tuple[Read
     once = [*((turn, _TAKEN) for turn in turns[1:]), *((_KEPT, name) for name in names)]
     for stage in (once, product(turns[1:], names)):
         for turn, name in stage if not good else ():
-            words = [] if turn == _KEPT else [f"the frames are {turn}"]
+            words = [] if turn == _KEPT else [f"they are {turn} (--orientation {ORIENTATIONS[turn]})"]
             words += [] if name == _TAKEN else [_STEPS.get(name, f"the shots were taken in the order {name}")]
             known = None if name == _TAKEN or name in _STEPS else name
             good.append(Reading(" and ".join(words), fit(turn, orders[name])[1], known))

@@ -638,6 +638,11 @@ class Prepared:
     def sigma(self) -> FloatArray:
         return np.outer(self.left.singular, self.right.singular)
 
+    def gain(self, lam: float) -> FloatArray:
+        """Return sigma / (sigma^2 + ``lam``) (r, r'), the image's coefficients by data; 0 where sigma is."""
+        sigma = self.sigma
+        return np.divide(sigma, np.square(sigma) + lam, out=np.zeros_like(sigma), where=sigma > 0)
+
     def as_solved(self, frame: FloatArray) -> FloatArray:
         return centre_frame(frame) if self.centre else frame
 

@@ -263,8 +263,7 @@ class Propagation:
 
     @cached_property
     def gain(self) -> FloatArray:
-        sigma = self._sigma
-        return np.divide(sigma, np.square(sigma) + self.lam, out=np.zeros_like(sigma), where=sigma > 0)
+        return self.model.prepared.gain(self.lam)
 
     @cached_property
     def terms(self) -> Pair:

@@ -1,4 +1,4 @@
-"""Pages: of a run, a calibration or an image from its folder's files alone (`mitsim report`), and of `mitsim demo`.
+"""Pages of a run, a calibration or an image, from its folder's files alone (`mitsim report`).
 
 The truth of an image is read from its run, if the run is still in its place.
 """
@@ -24,7 +24,7 @@ from mitsim.core.errors import MitsimError, check_arguments
 from mitsim.core.exr import checksum, finite_channel, read_frame, verify_files, write_frame
 from mitsim.core.files import PAGE, PICTURES, output_folder, read_json, remove_page, write_bytes, write_text
 from mitsim.core.headline import calibration_headline, each_once, frames_headline, image_headline
-from mitsim.core.images import card, data_uri, grey_png, lightness, png
+from mitsim.core.images import card, lightness, png
 from mitsim.core.job import size_text
 from mitsim.core.manifests import MANIFEST, CalibrationManifest, RunManifest, read_manifest
 from mitsim.core.runs import TRUTH, load_mosaic, load_run
@@ -34,10 +34,9 @@ from mitsim.metrics import Quality, psnr, summary_of, truth_for
 from mitsim.reconstruct import reconstruct
 from mitsim.reconstruct.colour import ColourModel, chart, delta_e, linear_srgb
 from mitsim.reconstruct.factors import camera_parts, load_calibration
-from mitsim.reconstruct.misfit import chi_square_text
 from mitsim.reconstruct.request import IMAGE_FILE, PICTURE_FILE, RESULT_FILE
 from mitsim.report import pages
-from mitsim.report.pages import LARGEST, REFLECTANCE, SMALLEST, Picture, lines_of, page_figure, render_page
+from mitsim.report.pages import LARGEST, REFLECTANCE, SMALLEST, Picture, lines_of, render_page
 
 _ELSEWHERE = {
     *("kind", "format", "status", "configuration", "configuration_sha256", "checksums", "patterns", "plan"),
@@ -601,145 +600,3 @@ def state_image(folder: Path, lines: ColourManifest, **more: Any) -> None:
 def _mean(values: Iterable[float | None]) -> float | None:
     known = [value for value in values if value is not None]
     return float(np.mean(known)) if known else None
-
-
-# -------- The page of `mitsim demo`: one self-contained HTML file without scripts or links
-
-_PATTERN_CORNER = 40
-_SMALLEST = 384
-_GAIN_DB = 0.5
-"""Least gain that counts: a tenth of the squared error."""
-COVERED = 1.96
-"""Standard uncertainties of a 95 % interval."""
-
-
-@dataclass(frozen=True, eq=False)
-class Trust:
-    """Stated standard ``uncertainty`` and actual ``error`` of an image, (n, n') reflectance.
-
-    ``chi_square`` is None where there are no more data than unknowns; ``cause`` flags the misfit.
-    """
-
-    uncertainty: FloatArray
-    error: FloatArray
-    chi_square: float | None = None
-    cause: str = ""
-
-    @classmethod
-    def of(cls, image: reconstruct.Reconstruction, truth: FloatArray) -> Trust | None:
-        """Compare an ``image`` with the truth; None where its uncertainty is not known."""
-        if image.uncertainty is None:
-            return None
-        found = (image.misfit.chi_square, image.misfit.reason) if image.misfit else (None, "")
-        return cls(image.uncertainty, np.abs(image.image - truth), *found)
-
-    @property
-    def stated(self) -> float:
-        return float(np.sqrt(np.mean(np.square(self.uncertainty))))
-
-    @property
-    def actual(self) -> float:
-        return float(np.sqrt(np.mean(np.square(self.error))))
-
-    @property
-    def within(self) -> float:
-        return float(np.mean(self.error <= COVERED * self.uncertainty))
-
-    def pictures(self) -> tuple[Picture, Picture]:
-        largest = max(float(self.uncertainty.max()), float(np.percentile(self.error, _SHOWN_PERCENT)))
-        stated, actual = (f"rms {pages.reflectance(value)}" for value in (self.stated, self.actual))
-        style: dict[str, Any] = {"ends": (0.0, largest), "quantity": "uncertainty"}
-        return (
-            Picture.of("stated", "Stated: standard uncertainty", self.uncertainty, stated, **style),
-            Picture.of("actual", "Actual: |image \N{MINUS SIGN} truth|", self.error, actual, **style),
-        )
-
-    def summary(self) -> dict[str, Any]:
-        return {
-            "uncertainty": self.stated,
-            "rms_error": self.actual,
-            "within_95": self.within,
-            "chi_square": self.chi_square,
-            "cause": self.cause or None,
-        }
-
-
-@dataclass(frozen=True, eq=False)
-class Recovery:
-    image: FloatArray
-    quality: Quality
-    lam: float
-    status: str
-    trust: Trust | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class FamilyResult:
-    """A pattern family.
-
-    ``shots`` counts frames. ``patterns`` are some (n, n) examples. ``idealised`` solves the paper's model, ``rendered``
-    rendered frames with calibrated factors, whose PSNR [dB] by exposure convention is ``by_exposure``.
-    """
-
-    name: str
-    label: str
-    shots: int
-    patterns: tuple[FloatArray, ...]
-    singular_values: FloatArray
-    idealised: Recovery
-    rendered: Recovery
-    by_exposure: Mapping[str, float]
-
-
-def verdict(best: FamilyResult, baseline: FamilyResult) -> tuple[str, str]:
-    """Return headline and detail, such as "49 dots beat uniform by 11.0 dB"."""
-    ours, theirs = best.rendered.quality.psnr_db, baseline.rendered.quality.psnr_db
-    if best.name == baseline.name:
-        return f"{best.label}: {ours:.1f} dB", "PSNR, rendered light and calibrated factors."
-    gain, name = ours - theirs, baseline.label[:1].lower() + baseline.label[1:]
-    if not best.rendered.quality.is_image:
-        headline = f"{best.label}: no image, {ours:.1f} dB"
-    elif gain >= _GAIN_DB:
-        headline = f"{best.label} beat {name} by {gain:.1f} dB"
-    else:
-        headline = f"{best.label}: {abs(gain):.1f} dB {'above' if gain >= 0 else 'below'} {name}"
-    if best.rendered.quality.is_image and gain >= 0 and best.rendered.trust and best.rendered.trust.cause:
-        headline += ", but part of their light fits no image"
-    ideal = best.idealised.quality.psnr_db - baseline.idealised.quality.psnr_db
-    detail = f"{ours:.1f} against {theirs:.1f} dB PSNR, rendered light and calibrated factors."
-    return headline, f"{detail} The idealised model says {ideal:+.1f} dB."
-
-
-def render_demo(report: Mapping[str, Any]) -> str:
-    """Render the page; the same data give the same bytes, and a section without data is left out.
-
-    ``truth`` (n, n) is a reflectance, 1 = calibration board, row 0 at the top as seen along +z. ``render`` is light, 1
-    = white. ``main`` is the family whose errors are shown; the tiles compare the best family with the first.
-    ``frames`` are in DN by caption, and ``budget`` has name, relative rms of the expected frames (None: unknown) and
-    meaning of each source of error.
-    """
-    from mitsim.report.plots import singular_values
-
-    families, best = report["families"], dict[str, str]()
-    for row in ("idealised", "rendered") if families else ():
-        best[row] = max(families, key=lambda each: getattr(each, row).quality.psnr_db).name
-    curves = {each.label: each.singular_values for each in families}
-    trust = next((each.rendered.trust for each in families if each.name == report["main"]), None)
-
-    def pattern_of(pattern: FloatArray) -> str:
-        values = pattern[:_PATTERN_CORNER, :_PATTERN_CORNER]
-        return data_uri(grey_png((values + 1.0) / 2.0 if values.min() < 0.0 else values, smallest=_SMALLEST))
-
-    return render_page(
-        "report.html",
-        report=report,
-        best=best,
-        singular_values=page_figure(singular_values(curves))[0] if curves else "",
-        frames=[Picture.of(name, name, dn, unit="DN", ends=(None, None)) for name, dn in report["frames"].items()],
-        errors=trust.pictures() if trust else (),
-        grey=pages.MAPS["light"][0],
-        pattern_corner=_PATTERN_CORNER,
-        picture_of=lambda image: data_uri(grey_png(lightness(image), smallest=_SMALLEST)),
-        pattern_of=pattern_of,
-        chi_square=chi_square_text,
-    )

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import html
 import io
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
 from pathlib import Path
@@ -35,7 +35,7 @@ from mitsim.core.arrays import FloatArray
 from mitsim.core.environment import versions
 from mitsim.core.errors import MitsimError, check_arguments
 from mitsim.core.files import write_bytes
-from mitsim.core.images import lightness
+from mitsim.core.images import lightness, reduce_frame
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.mask import CameraMask
@@ -122,7 +122,7 @@ class Unexposed:
     """Frames of a scene before any exposure, and the factors that solve them.
 
     ``centre`` is True where means are subtracted from frames; ``plane`` is that of an idealised scene, None for that of
-    the factors.
+    the factors; ``bench`` may have another mask.
     """
 
     lit: LitScene
@@ -132,10 +132,11 @@ class Unexposed:
     centre: bool
     seed: int
     plane: Plane | None = None
+    bench: Apparatus | None = None
 
     @cached_property
     def expected(self) -> ExpectedFrames:
-        return self.lit.expected_frames(self.model, self.family, self.plane)
+        return self.lit.expected_frames(self.model, self.family, self.plane, self.bench)
 
     def seconds(self, exposure: str) -> float:
         if exposure in (EQUAL_PEAK, DIM):
@@ -203,24 +204,25 @@ def peak_time(bench: Apparatus, expected: ExpectedFrames) -> float:
     return Exposure().choose(bench.devices, peak_irradiance(expected))
 
 
-def bin_frame(frame: FloatArray, binning: int) -> FloatArray:
-    if binning == 1:
-        return frame
-    rows, columns = (size // binning for size in frame.shape)
-    return np.asarray(frame.reshape(rows, binning, columns, binning).mean(axis=(1, 3)))
-
-
 def accumulate(
     exposer: Exposer, family: PatternFamily, expected: ExpectedFrames, models: Sequence[Prepared], binning: int = 1
 ) -> list[Accumulator]:
     sums = [model.accumulator() for model in models]
     with single_threaded_blas():
-        ambient = taken_off(exposer, family, expected)
-        for measurement, row, column in exposer.measurements(family, expected):
-            frame = bin_frame(measurement - ambient, binning)
+        for measurement, row, column in measured(exposer, family, expected):
+            frame = reduce_frame(measurement, binning)
             for each in sums:
                 each.add(frame, row, column)
     return sums
+
+
+def measured(
+    exposer: Exposer, family: PatternFamily, expected: ExpectedFrames
+) -> Iterator[tuple[FloatArray, int, int]]:
+    """Yield noisy measurements without ambient light [electrons/s], and their patterns."""
+    ambient = taken_off(exposer, family, expected)
+    for measurement, row, column in exposer.measurements(family, expected):
+        yield measurement - ambient, row, column
 
 
 # -------- The paper's idealised camera
@@ -260,11 +262,11 @@ class IdealCamera:
         best = best_term(centre_terms(self.terms) if self.centre else self.terms)
         return best.left, best.right
 
-    def calibrated(self, board_flux: float) -> Pair:
-        """Return the factors in a calibration's unit [sqrt(electrons / s)]."""
+    def calibrated(self, board_flux: float, term: Pair | None = None) -> Pair:
+        """Return the factors, or another ``term``, in a calibration's unit [sqrt(electrons / s)]."""
         model = self.bench.projector
         rate = electrons_from_irradiance(board_flux, 1.0, self.bench.sensor, model.effective_wavelength_nm)
-        left, right = self.factors
+        left, right = self.factors if term is None else term
         return left * np.sqrt(rate), right * np.sqrt(rate)
 
     def frames(self, family: PatternFamily, flux: FloatArray, plane: Plane | None = None) -> ExpectedFrames:

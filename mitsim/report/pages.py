@@ -45,8 +45,7 @@ def _environment() -> Environment:
         loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
     filters: dict[str, Any] = {"sci": scientific, "typeset": typeset, "sentence": sentence, "seconds": duration}
-    more: dict[str, Any] = {"rms": reflectance, "db": lambda value: f"{value:.1f} dB", "stages": stages_of}
-    environment.filters.update(filters | more)
+    environment.filters.update({**filters, "stages": stages_of})
     return environment
 
 

@@ -183,18 +183,6 @@ def grouped_bars(groups: Mapping[str, Mapping[str, Mean]], x: str, title: str = 
     return figure
 
 
-def singular_values(curves: Mapping[str, npt.ArrayLike]) -> Figure:
-    figure, ((axes,),) = panels_of(1, 1, 0.42 * WIDTH)
-    for index, (name, values) in enumerate(curves.items()):
-        ordered = np.sort(np.asarray(values, dtype=np.float64).ravel())[::-1]
-        share = 100.0 * np.arange(1, ordered.size + 1) / ordered.size
-        axes.semilogy(share, ordered / ordered[0], lw=2.0, label=name, **line_style(index))
-    axes.set_xlim(0, 100)
-    label_axes(axes, "singular value's rank [% of all]", "singular value, relative to the largest [1]")
-    axes.legend(fontsize=FONT - 1, frameon=False, loc="lower left")
-    return figure
-
-
 # -------- Parts of figures
 
 

@@ -103,17 +103,6 @@ def window_at(
     return (float(top), float(bottom)), (float(left), float(right))
 
 
-def straightening(where: str, projector: mi.Emitter, camera: mi.Sensor, grid: ProjectorGrid, z: float) -> FloatArray:
-    """Return the (3, 3) homography that removes the keystone from tan-angles (row, column, 1) at the depth ``z``.
-
-    It maps to the positions of the projector pixels if the window filled its bounding box evenly. Raises MitsimError if
-    the projector does not light the plane.
-    """
-    corners = _window_corners(where, projector, camera, grid.place, z)
-    low, high = corners.min(axis=0), corners.max(axis=0)
-    return _homography(corners, np.where([[0, 0], [0, 1], [1, 0], [1, 1]], high, low))
-
-
 def _window_corners(where: str, projector: mi.Emitter, camera: mi.Sensor, window: _Place, z: float) -> FloatArray:
     """Return the (4, 2) tan-angles (row, column) of the window's corners on the plane at ``z``, from four probes."""
     half = 0.25 * z  # any four points do

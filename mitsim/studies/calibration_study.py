@@ -2,9 +2,10 @@
 
 *entries*: factors of noisy frames against those of expected frames. *losses*: cost of each source in one image.
 
-The squared error E of the image is the sum of parts V. Parts of noise follow from a perturbation of the solver with a
-fixed lambda (:mod:`mitsim.studies.causes`). Parts of the scene's light that the factors lack follow from noiseless
-frames without one cause after another, less the part that lambda alone removes. The rest of E is unexplained and may
+The squared error E of the image is the sum of parts V. With lambda fixed the solver is linear, so that parts of noise,
+and how much one image's error scatters, follow from draws of the noise in the solver's data. Parts of the scene's light
+that the factors lack follow from noiseless frames without one cause after another, less the part that lambda alone
+removes. The rest of E is unexplained and may
 belong to any source. A source costs ``10 log10(E / (E - V))``, the gain of the image without the source; these decibels
 do not add up. The loss by a drift after the session is measured by :mod:`mitsim.studies.drift_study`.
 """
@@ -12,29 +13,32 @@ do not add up. The loss by a drift after the session is measured by :mod:`mitsim
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
-from pathlib import Path
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from mitsim.acquire.exposure import ambient_shots, takes_ambient_frame
 from mitsim.bench.request import Exposure
-from mitsim.calibrate.board_session import LitSession, Session, manifest_of
+from mitsim.calibrate.board_session import LitSession, Session, entry_variances, manifest_of
 from mitsim.calibrate.calibrate import NOISE_FREE, NOISY, estimates
 from mitsim.core.arrays import FloatArray
-from mitsim.core.errors import MitsimError
 from mitsim.core.job import Job
 from mitsim.core.manifests import SIDES as FACTORS
 from mitsim.core.parallel import single_threaded_blas
+from mitsim.core.seeds import stream
 from mitsim.devices.patterns import read_name
 from mitsim.devices.sensor import digital_of
-from mitsim.devices.session import SIDES, Drift, load_recipe
+from mitsim.devices.session import Drift, load_recipe
+from mitsim.reconstruct.accumulation import pattern_response
 from mitsim.reconstruct.factors import Estimate, Factors, decibels
-from mitsim.report.lit_scene import SPECKLE, IdealCamera, LitScene
+from mitsim.reconstruct.solver import Pair, Prepared
+from mitsim.report.lit_scene import NONUNIFORMITY, SPECKLE, IdealCamera, LitScene
+from mitsim.sensor.chain import specimen
 from mitsim.studies import waterfall_study as waterfall
-from mitsim.studies.causes import Noise, Scatter
-from mitsim.studies.drift_study import AMBIENT, SESSION, DriftStand, squared_error
+from mitsim.studies.drift_study import DriftStand
 from mitsim.studies.framework.claims import Judged, measured
 from mitsim.studies.framework.experiment import Found, Point, Results, Scope, Study
 from mitsim.studies.framework.panels import Bars, Part
@@ -47,21 +51,46 @@ Row = dict[str, Any]
 
 # -------- Cost of each source in an image
 
-CAPTURE, SCENE, SOLVER, UNEXPLAINED = "capture", "scene", "solver", "unexplained"
+CAPTURE, SESSION, SCENE, SOLVER, UNEXPLAINED = "capture", "session", "scene", "solver", "unexplained"
+AMBIENT, OFFSETS = "ambient frame", "offset nonuniformity"
 RENDERING, LAMBDA, REST = "rendering", "lambda and resolution", "all else"
 ERROR_SOURCES = {
-    waterfall.DETAIL: "detail inside projector pixels",
-    waterfall.DEPTH: "depth beside the board's",
-    waterfall.OCCLUSION: "edges that hide pixels from part of the sensor",
-    waterfall.INTERREFLECTION: "light over several surfaces",
-    waterfall.MIRRORS: "light over mirrors",
-    waterfall.GLOSS: "gloss over the sensor",
-    waterfall.BLACK_LEVEL: "light that black pixels leak",
+    "interreflection": "light over several surfaces",
+    "mirrors": "light over mirrors",
+    "black-level": "light that black pixels leak",
+    waterfall.SCENE: "depth, gloss, edges and detail",
 }
 """Effects that factors lack, in the order of their removal."""
 SURE = 3.0
 """Standard errors from which the unexplained part is not chance."""
 _LEAST_LEFT = 1e-9
+_DRAWS = 200
+"""Draws of each noise: they determine its squared error to 7 % of its deviation, and the deviation to 5 %."""
+
+Noise = Mapping[str, float]
+"""Variances of independent noise by kind.
+
+*datum*: of each datum; *ambient*: of each pixel of a frame that is subtracted from all others; *left*, *right*: of each
+number of a factor; *light*: of each scene pixel's light relative to a white board's, in all frames alike.
+"""
+
+
+def draw(noise: Noise, model: Prepared, patterns: Pair, scene: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Return a draw of the error (r, r') that normal ``noise`` makes in a ``model``'s data of a ``scene``.
+
+    U of both sides is orthonormal, so that noise of variance v in each datum is noise of variance v in W.
+    """
+    left, right, normal = model.left, model.right, rng.standard_normal
+    rows, columns = ((side.sensor_size, side.scene_size) for side in (left, right))
+    kinds: Mapping[str, Callable[[], FloatArray]] = {
+        "datum": lambda: normal(model.sigma.shape),
+        "ambient": lambda: left.common.T @ normal((rows[0], columns[0])) @ right.common,
+        "left": lambda: pattern_response(left, normal(rows), patterns[0]) @ scene @ right.response,
+        "right": lambda: left.response.T @ scene @ pattern_response(right, normal(columns), patterns[1]).T,
+        "light": lambda: left.response.T @ normal(scene.shape) @ right.response,
+    }
+    drawn = (math.sqrt(variance) * kinds[kind]() for kind, variance in noise.items() if variance)
+    return sum(drawn, np.zeros_like(model.sigma))
 
 
 def losses(stand: DriftStand, lit: LitSession, clear: Factors) -> list[Row]:
@@ -69,60 +98,62 @@ def losses(stand: DriftStand, lit: LitSession, clear: Factors) -> list[Row]:
 
     ``squared_error`` is the source's, mean over the image, negative where the image is worse without the source.
     """
+    scene, light = stand.lit.truth, stand.lit.light
+    model, pixels = stand.lit.rendered_frames(clear, stand.family, stand.seed).prepare(), scene.size
+    patterns = stand.family.left.astype(np.float64), stand.family.right.astype(np.float64)
+    gain = model.gain(stand.before.lam)
 
-    def row(of: str, source: str, lost: tuple[float, float], square: float, deviation: float) -> Row:
-        name = source if of == UNEXPLAINED else f"{of}: {source}"
-        found = {"lost_db": lost[0], "error_db": lost[1], "squared_error": square, "deviation": deviation}
-        return {"kind": "losses", "of": of, "source": source, **found, "name": name}
+    def draws(source: tuple[str, str], noise: Noise) -> FloatArray:
+        rng = stream(stand.seed, "losses", *source)
+        return np.array([gain * draw(noise, model, patterns, scene, rng) for _ in range(_DRAWS)], dtype=np.float32)
 
-    scene, light, noises = stand.lit.truth, stand.lit.light, noises_of(stand, lit)
-    exact = replace(stand.linear, left=clear.left, right=clear.right)
-    pixels, scatter = scene.size, Scatter(exact, scene)
-    sampled = sum((noise for (_, name), noise in noises.items() if name == RENDERING), Noise())
-    drawn = sum(noises.values(), Noise()) - sampled
-    # Images of the scene's light without noise: whole, and without one cause after another.
-    ablation, off, seen = waterfall.Ablation(light), frozenset[str](), [stand.clear(clear, light)]
-    removed = [name for name in ERROR_SOURCES if name in ablation.effects]
-    for name in removed:
-        off |= {name}
-        seen.append(stand.clear(clear, ablation.without(off)))
-    steady = seen[0] + sum(stand.fixed.values(), np.zeros_like(scene)) - scene
+    def part(noise: FloatArray, beside: FloatArray) -> tuple[float, float]:
+        """Return what draws (k, r, r') of noise add to the squared error of all else, and its standard deviation."""
+        alone, added = np.square(noise).sum(axis=(1, 2)), (noise * (noise + 2 * beside)).sum(axis=(1, 2))
+        return float(alone.mean()) / pixels, float(added.std()) / pixels
 
-    parts = dict[tuple[str, str], tuple[float, float]]()  # squared errors and their standard deviations
-    for source, noise in noises.items():
-        among = drawn + (noise if source[1] == RENDERING else Noise())
-        parts[source] = stand.linear.variance(scene, noise) / pixels, scatter.share(noise, among, steady) / pixels
-    error = seen[0] - scene
-    for name, more in stand.fixed.items():
-        parts[CAPTURE, name] = _square(error + more) - _square(error), 0.0
-        error = error + more
-    parts[SCENE, ERROR_SOURCES[waterfall.DETAIL]] = 0.0, 0.0
-    for name, before, after in zip(removed, seen, seen[1:], strict=False):
-        moved = scatter.common(sampled, before - after) / pixels
-        parts[SCENE, ERROR_SOURCES[name]] = _square(before - scene) - _square(after - scene), moved
-    bias, left = _square(exact.expected_image(scene).image - scene), seen[-1] - scene
-    rest = _square(left) - bias - exact.variance(scene, sampled) / pixels
-    parts[SCENE, REST] = rest, scatter.deviation(sampled, left) / pixels
+    with single_threaded_blas():
+        noises = {source: draws(source, noise) for source, noise in noises_of(stand, lit).items()}
+        uneven, offsets = (model.image(gain * data) for data in fixed_data(stand, model))
+    # Images without noise: whole, and without one cause after another.
+    ablation, off, clean = waterfall.Ablation(light), frozenset[str](), stand.clear(clear, light)
+    seen, removed = [clean + uneven + offsets, clean + uneven, clean], [(CAPTURE, OFFSETS), (CAPTURE, NONUNIFORMITY)]
+    for name in ERROR_SOURCES:
+        if name in ablation.effects:
+            off |= {name}
+            seen.append(stand.clear(clear, ablation.without(off)))
+            removed.append((SCENE, ERROR_SOURCES[name]))
+
+    # Squared errors of the parts and their standard deviations. Light is sampled once, also in images without noise.
+    parts = {(SCENE, ERROR_SOURCES[waterfall.SCENE]): (0.0, 0.0)}
+    sampled = noises[CAPTURE, RENDERING]
+    drawn, steady = np.sum([*noises.values()], axis=0) - sampled, model.coefficients(seen[0] - scene)
+    for cause, noise in noises.items():
+        parts[cause] = part(noise, steady + drawn - (0.0 if noise is sampled else noise))
+    for cause, (before, after) in zip(removed, pairwise(seen), strict=True):
+        moved = 2 * (sampled * model.coefficients(before - after)).sum(axis=(1, 2)).std() / pixels
+        parts[cause] = _square(before - scene) - _square(after - scene), float(moved)
+    bias = _square(model.image(gain * model.sigma * model.coefficients(scene)) - scene)
+    rendering, chance = part(sampled, model.coefficients(seen[-1] - scene))
+    parts[SCENE, REST] = _square(seen[-1] - scene) - bias - rendering, chance
     parts[SOLVER, LAMBDA] = bias, 0.0
 
-    whole, explained = squared_error(stand.before_db), sum(square for square, _ in parts.values())
-    left_over, chance = whole - explained, scatter.deviation(drawn, steady) / pixels
-    lost = _decibels(left_over / whole)
-    rest_lost = lost, abs(_decibels((left_over + chance) / whole) - lost)
-    return [
-        *(
-            row(*source, gain_without(square, whole, explained, deviation), square, deviation)
-            for source, (square, deviation) in parts.items()
-        ),
-        row(UNEXPLAINED, "not explained", rest_lost, left_over, chance),
-    ]
+    whole, explained = _square(stand.before.image - scene), sum(square for square, _ in parts.values())
+    parts[UNEXPLAINED, "not explained"] = whole - explained, part(drawn, steady)[1]
+    rows = list[Row]()
+    for (of, source), (square, deviation) in parts.items():
+        name, most = (source, whole) if of == UNEXPLAINED else (f"{of}: {source}", explained)
+        lost, error_db = gain_without(square, whole, most, deviation)
+        found = {"lost_db": lost, "error_db": error_db, "squared_error": square, "deviation": deviation, "name": name}
+        rows.append({"kind": "losses", "of": of, "source": source, **found})
+    return rows
 
 
-def judge_rest(squared_error: float, deviation: float) -> tuple[str, bool]:
+def judge_rest(row: Mapping[str, Any]) -> tuple[str, bool]:
     """Return a sentence on the squared error that no source explains, and True if chance may have caused it."""
-    errors = abs(squared_error) / deviation if deviation else 0.0
+    errors = abs(row["squared_error"]) / row["deviation"] if row["deviation"] else 0.0
     size = f"the unexplained part is {errors:.1f} of its standard errors"
-    if abs(squared_error) > SURE * deviation:
+    if abs(row["squared_error"]) > SURE * row["deviation"]:
         return f"{size}: the sources do not make the image's error, and a cause is missing", False
     return size, True
 
@@ -148,54 +179,39 @@ def _decibels(part: float) -> float:
 
 def noises_of(stand: DriftStand, lit: LitSession) -> Mapping[tuple[str, str], Noise]:
     """Return the noise of capture and session by its source."""
-    found = dict[tuple[str, str], Noise]()
-    for name, noise in stand.noises.items():
-        if name != SESSION and (name not in (AMBIENT, SPECKLE) or noise != Noise()):
-            found[CAPTURE, name] = noise
+    found, frames, seconds = dict[tuple[str, str], Noise](), stand.frames, stand.exposure_s
+    for name, variance in frames.noises(seconds).items():
+        if name != NONUNIFORMITY and (variance or name != SPECKLE):
+            found[CAPTURE, name] = {"datum": variance * (2 if stand.family.signed else 1)}
+    if takes_ambient_frame("auto", stand.family, frames.expected):
+        exposer = frames.exposer(seconds)
+        variance = (exposer.sensor_noise(exposer.electrons(frames.expected.projector_off)) / seconds) ** 2
+        found[CAPTURE, AMBIENT] = {"ambient": variance / ambient_shots(stand.family)}
+    # The truth's own sampling is in the error as much as that of the light. A session's is averaged over lines.
     light, factors = stand.lit.light, (stand.factors.left, stand.factors.right)
-    # The truth's own sampling is in the error as much as that of the light.
     sampled = light.apparent.error_of(light.flux_error) ** 2 + light.apparent.error**2
-    found[CAPTURE, RENDERING] = Noise(light=sampled)
-    left, right = (entry_variances(lit, factors, side) for side in SIDES)
-    for source, variance in left.items():
-        found[SESSION, source] = Noise(left=float(variance.mean()), right=float(right[source].mean()))
-    found[SESSION, RENDERING] = session_rendering(lit.light.flux, lit.light.flux_error, factors)
+    found[CAPTURE, RENDERING] = {"light": sampled}
+    left, right = entry_variances(lit.session, lit.uniform_rate, lit.exposure_s, factors)
+    for source, own in left.items():
+        found[SESSION, source] = {"left": float(own.mean()), "right": float(right[source].mean())}
     return found
 
 
-def session_rendering(flux: FloatArray, flux_error: FloatArray, factors: tuple[FloatArray, FloatArray]) -> Noise:
-    """Return the noise that sampling of a session's light leaves in its ``factors``.
-
-    Where pixel (x, y) of the board is lit by 1 + e_xy of its light, column x of the left factor is multiplied by
-    1 + sum_y e_xy w_y, w_y = Phi_R(y) . v / |v|^2, v the sum of all columns of Phi_R. ``flux`` and ``flux_error``
-    (n^2,) are of each projector pixel.
-    """
-    lit = flux > 0
-    error = float(np.mean(np.square(flux_error[lit] / flux[lit]))) if lit.any() else 0.0
-    spread = []
-    for factor in factors:
-        common = factor.sum(axis=1)
-        spread.append(float(np.square(common @ factor / np.dot(common, common)).sum()))
-    return Noise(left_light=error * spread[1], right_light=error * spread[0])
-
-
-def entry_variances(lit: LitSession, factors: tuple[FloatArray, FloatArray], side: str) -> dict[str, FloatArray]:
-    """Return the predicted variance (m, n) of the entries in one ``side``'s factor, by source.
-
-    u_i = Y_i v / |v|^2 has the variance sum_c V_rc v_c^2 / |v|^4 in row r, V being that of a response's pixels, and U
-    H^T / N averages N of them with signs. Noise that all responses share enters column p by the mean of its signs:
-    fully where they are all +1, and not at all elsewhere.
-    """
-    signs, common = lit.session.signs, (factors[1] if side == SIDES[0] else factors[0]).sum(axis=1)
-
-    def spread(part: FloatArray) -> FloatArray:
-        variance = np.broadcast_to(part, lit.uniform_rate.shape)
-        weights = np.square(common) / np.dot(common, common) ** 2
-        return np.asarray((variance if side == SIDES[0] else variance.T) @ weights)
-
-    own, shared = lit.response_variances()
-    even, first = np.full(len(signs), 1 / signs.shape[1]), np.square(signs.mean(axis=1))
-    return {source: np.outer(spread(own[source]), even) + np.outer(spread(shared[source]), first) for source in own}
+def fixed_data(stand: DriftStand, model: Prepared) -> Pair:
+    """Return the data (r, r') of a ``model`` that responses and offsets of pixels add, beyond what factors have."""
+    sensor, frames, shape = stand.lit.bench.sensor, stand.frames, stand.lit.bench.geometry.frame_shape
+    own, response, offsets = specimen(sensor, shape), np.ones(shape), np.zeros(shape)
+    if own.response is not None:
+        rows, columns = own.response.mean(axis=1), own.response.mean(axis=0)
+        response = own.response * rows.mean() / np.outer(rows, columns)
+    if own.offset_e is not None and not frames.expected.has_ambient:
+        offsets += own.offset_e / stand.exposure_s
+    if own.dark_e_per_s is not None and not frames.expected.has_ambient:
+        offsets += own.dark_e_per_s - sensor.superpixel_dark_current_e_per_s
+    lit = [frames.exposer(1.0).electrons(frame) for frame in frames.expected]
+    rates = ((response - 1) * each for each in lit), (offsets for _ in lit)
+    uneven, added = (model.accumulator(stand.family.measurements(each)).sum for each in rates)
+    return uneven, added
 
 
 # -------- The study
@@ -208,11 +224,11 @@ _SAID_DB = 0.005
 def judge_factors(lit: LitSession, noisy: Estimate, clean: Estimate) -> list[Row]:
     """Return errors of each factor beside their prediction, and those of its entries in predicted deviations."""
     rows = list[Row]()
-    pairs = zip(FACTORS, SIDES, (clean.left, clean.right), (noisy.left, noisy.right), strict=True)
-    for name, side, exact, found in pairs:
+    exacts = clean.left, clean.right
+    every = entry_variances(lit.session, lit.uniform_rate, lit.exposure_s, exacts)
+    for name, variances, exact, found in zip(FACTORS, every, exacts, (noisy.left, noisy.right), strict=True):
         # Factors are known up to a common scale and sign; this one is not drawn towards zero by the noise.
         found = found * (np.vdot(exact, exact) / np.vdot(found, exact))
-        variances = entry_variances(lit, (clean.left, clean.right), side)
         deviation = np.asarray(np.sqrt(sum(variances.values(), np.zeros(1))))
         off = (found - exact) / deviation
         norm = float(np.linalg.norm(exact))
@@ -226,17 +242,12 @@ def judge_factors(lit: LitSession, noisy: Estimate, clean: Estimate) -> list[Row
 
 def _points(scope: Scope) -> list[Point]:
     read_name(scope.patterns)
-    recipe = load_recipe(None if scope.recipe is None else Path(scope.recipe))
-    if recipe.depths:
-        raise MitsimError(
-            f"study calibration: the recipe has {len(recipe.depths)} depths, and a report is of one session; leave "
-            "depths out, and move the board's plane by -D or the scene's scene_distance"
-        )
+    load_recipe(scope.recipe).of_one_depth()
     return [Point.of(scope.setup, recipe=scope.recipe, patterns=scope.patterns, seed=scope.seeds[0])]
 
 
 def _measure(studio: Studio, point: Point) -> Found:
-    bench, recipe = studio.bench(point.setup), load_recipe(None if point["recipe"] is None else Path(point["recipe"]))
+    bench, recipe = studio.bench(point.setup), load_recipe(point["recipe"])
     job, seed, accuracy = Job(), int(point["seed"]), point.setup.accuracy
     family = bench.family(point["patterns"], seed)
     Exposure(None, recipe.exposure_fraction).check(bench.sensor, bench.devices.camera_file)
@@ -250,7 +261,7 @@ def _measure(studio: Studio, point: Point) -> Found:
     *lost, rest = losses(stand, lit, Factors.of(clean, manifest))
     left, right = IdealCamera(bench, bench.geometry.mask).calibrated(scene.board_flux)
     geometric = replace(stand, factors=replace(stand.factors, left=left, right=right)).before_db
-    words, by_chance = judge_rest(rest["squared_error"], rest["deviation"])
+    words, by_chance = judge_rest(rest)
     session_row: Row = {
         "kind": "session", "frames": session.shots,
         "exposure_seconds": len(session.order) * (lit.exposure_s * recipe.repeats),
@@ -284,11 +295,6 @@ def _tables(results: Results) -> list[Part]:
     return found
 
 
-def _explained(rows: DataFrame) -> tuple[str, bool]:
-    (row,) = rows.to_dict("records")
-    return judge_rest(row["squared_error"], row["deviation"])
-
-
 def _as_predicted(rows: DataFrame) -> tuple[str, bool]:
     chi = rows["chi_square"].astype(float)
     return f"chi-square of an entry {chi.min():.3f} to {chi.max():.3f}", bool((abs(chi - 1) < 0.1).all())
@@ -302,7 +308,7 @@ STUDY = Study(
     measure=_measure,
     claims=(
         Judged(
-            "All sources together make the image's squared error", _explained,
+            "All sources together make the image's squared error", lambda rows: judge_rest(rows.iloc[0]),
             where={"kind": "losses", "of": UNEXPLAINED},
         ),
         Judged("Errors of the factors are as large as the noise predicts", _as_predicted, where={"kind": "entries"}),

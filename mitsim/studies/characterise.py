@@ -7,7 +7,7 @@ they are compared with the camera file.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
@@ -427,32 +427,28 @@ class Characterisation:
 
     @property
     def parts(self) -> tuple[Part, Part]:
-        def cell(row: Row, name: str) -> str:
-            value = getattr(row, name)
-            if value is None or isinstance(value, str):
-                return value or ""
-            if name in ("found", "standard_error") and row.standard_error is not None:
-                return round_to_error(value, row.standard_error)
-            return f"{value:{'.1f' if name == 'deviations' else '.5g'}}"
+        def text(value: float | None, error: float | None = None) -> str:
+            return "" if value is None else round_to_error(value, error or math.nan)
 
-        def table(rows: Sequence[Row], **columns: str) -> tuple[Any, Any]:
-            shown = {head: name for head, name in columns.items() if not self.real or name not in ("set", "deviations")}
-            heads = tuple(head.replace("_", " ") for head in shown)
-            return heads, tuple(tuple(cell(row, name) for name in shown.values()) for row in rows)
+        def table(head: str, rows: Iterable[tuple[str, ...]]) -> tuple[Any, Any]:
+            # Of a real camera nothing is set, so that columns are empty.
+            kept = [column for column in zip(head.split("|"), *rows, strict=True) if any(column[1:])]
+            heads, *lines = zip(*kept, strict=True)
+            return heads, tuple(lines)
 
-        return (
-            Part(
-                "Results of EMVA 1288", "Numbers that the standard's procedure finds in the frames.",
-                *table(self.rows, figure="name", symbol="symbol", unit="unit", set="set", found="found"),
-                ("photon_transfer.png", "linearity.png", "dark_current.png"),
-            ),
-            Part(
-                "Fitted camera", "Fields of camera.toml, which --camera reads.",
-                *table(self.fields, camera_found="name", unit="unit", set="set", found="found",
-                       std_error="standard_error", off_by="deviations"),
-                notes=tuple(self.found.notes),
-            ),
+        figures = ((row.name, row.symbol, row.unit, text(row.set), text(row.found)) for row in self.rows)
+        fields = (
+            (row.name, row.unit, text(row.set), text(row.found, row.standard_error),
+             text(row.standard_error, row.standard_error), text(row.deviations, 1.0))
+            for row in self.fields
         )  # fmt: skip
+        plots = "photon_transfer.png", "linearity.png", "dark_current.png"
+        lead = "Numbers that the standard's procedure finds in the frames."
+        found = table("camera found|unit|set|found|std error|off by", fields)
+        return (
+            Part("Results of EMVA 1288", lead, *table("figure|symbol|unit|set|found", figures), plots),
+            Part("Fitted camera", "Fields of camera.toml, which --camera reads.", *found, notes=self.found.notes),
+        )
 
     def lines(self) -> list[str]:
         lines = [self.headline, f"Frames: {self.where}"]

@@ -55,7 +55,7 @@ def measure(studio: Studio, point: Point) -> Found:
     """Search a mask, and return predicted and rendered PSNR of it and of simple masks."""
     setup, patterns, seed, job = point.setup, str(point["patterns"]), int(point["seed"]), Job()
     bench = studio.bench(setup)
-    stand, session_s = studio.once("stand", 1, setup, lambda: stand_of(bench, 0))
+    stand = studio.once("stand", 1, setup, lambda: stand_of(bench, 0))
     own = studio.once("exposure", 6, (setup, patterns), lambda: bench.predict(patterns))
     goal = Goal(
         scene=setup.scene,
@@ -70,7 +70,7 @@ def measure(studio: Studio, point: Point) -> Found:
         accuracy=setup.accuracy,
     )
     folder, proved = studio.folder(point.key), []
-    for each in run_search(stand, goal, folder, job, session_s, searches(stand, goal, session_s))[0]:
+    for each in run_search(goal, folder, job, searches(stand, goal))[0]:
         file = write_camera(folder / each.name.replace(" ", "_"), bench, each)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # the bench has said which pixels it has
@@ -83,7 +83,7 @@ def measure(studio: Studio, point: Point) -> Found:
     ):
         for each, level in zip(proved, levels, strict=True):
             row = point.row(mask=each.name, model=model, psnr_db=level, frames=own.frames)
-            row |= {"exposure_total_s": each.exposure_total_s, "open_part": float(each.found.code.mean())}
+            row |= {"exposure_total_s": each.exposures[0], "open_part": float(each.found.code.mean())}
             row["case"] = f"{each.name}, {own.frames} frames, {point['dose']:g} of the light"
             if each.name == DESIGN:
                 row["gain_db"] = level - max(levels[1:])

@@ -47,10 +47,11 @@ _SHOWN = 1e-2
 
 @dataclass(frozen=True)
 class Design:
-    """Result of a design: candidates with the found one first, bounds that it has reached, and sensitivities [dB]."""
+    """Result of a design: candidates with the found one first, its bounds, PSNR by distance, and sensitivities [dB]."""
 
     candidates: tuple[Candidate, ...]
     bounds: tuple[str, ...]
+    distances: Mapping[str, float]
     sensitivity: Mapping[str, float]
     seconds_for_psnr: float | None
     complete: bool
@@ -72,10 +73,14 @@ class Design:
         rows = list[tuple[str, ...]]()
         for each in self.candidates:
             numbers = each.predicted, each.rendered, each.scatter, each.found.code.mean()
-            taken = (f"{one:.3g}" for one in (each.exposure_total_s, each.session_s, each.found.evaluations))
+            taken = (f"{one:.3g}" for one in (each.exposures[0], each.session_s, each.found.evaluations))
             rows.append((each.name, each.choice.shown, *(f"{one:.2f}" for one in numbers), *taken))
+            for case in each.cases if len(each.cases) > 1 else ():
+                shown = f"{case.get('picture', '')} dose {case['dose']:g}", "", f"{case['psnr_predicted']:.2f}"
+                rows.append((*shown, f"{case['psnr_rendered']:.2f}", "", "", f"{case['exposure_total_s']:.3g}", "", ""))
         notes = ["Scatter is that of single captures; open part is that of the features of a side."]
         notes += [f"Camera file, drawings and patterns that were found: {self.output}/design/, and so on."]
+        notes += [f"Not rendered, expected at {place}: {level:.2f} dB." for place, level in self.distances.items()]
         notes += [f"Expected change by {name}: {change:+.1f} dB." for name, change in self.sensitivity.items()]
         notes += [f"The design has reached a bound: {name}." for name in self.bounds]
         if self.seconds_for_psnr is not None:
@@ -101,35 +106,45 @@ class Design:
 
 
 def prove(goal: Goal, candidate: Candidate, camera: Path, job: Job, bench: Bench | None = None) -> Candidate:
-    """Predict, capture, calibrate and reconstruct with the ``camera`` of a candidate, once for each seed.
+    """Predict, capture, calibrate and reconstruct with the ``camera`` of a candidate, for each picture, dose and seed.
 
     ``bench`` has that camera; None: the goal's scene is opened with it.
     """
     from mitsim.api.bench import open_bench
 
-    bench = bench or open_bench(goal.scene, camera=str(camera))
     patterns = str(camera.parent / PATTERNS) if candidate.choice.lit else candidate.choice.patterns
-    frames = len(bench.family(patterns).shots)
-    predicted = bench.predict(patterns, exposure_total=candidate.exposure_total_s, job=job)
-    factors = bench.calibrate(accuracy=goal.accuracy, seed=goal.seed, job=job)
-    found, warnings = [], list(predicted.warnings)
-    for seed in range(goal.seeds):
-        exposed: dict[str, Any] = {"exposure": candidate.exposure_total_s / frames, "accuracy": goal.accuracy}
-        shots = bench.capture(patterns, job=job, seed=goal.seed + seed, **exposed)
-        image = reconstruct(shots, factors)
-        truth = truth_for(shots, factors.manifest.board_reflectance)
-        assert truth is not None
-        found.append(psnr(image.image, truth))
-        warnings += image.status.flags
+    cases, levels, predictions, warnings = [], [], [], list[str]()
+    factors = None
+    for shown in goal.shown:
+        own = bench or open_bench(goal.scene, camera=str(camera), **shown)
+        factors = factors or own.calibrate(accuracy=goal.accuracy, seed=goal.seed, job=job)
+        for dose, seconds in zip(goal.doses, candidate.exposures, strict=True):
+            predicted, found = own.predict(patterns, exposure_total=seconds, job=job), list[float]()
+            exposed: dict[str, Any] = {"exposure": seconds / predicted.frames, "accuracy": goal.accuracy}
+            warnings += predicted.warnings
+            for seed in range(goal.seeds):
+                shots = own.capture(patterns, job=job, seed=goal.seed + seed, **exposed)
+                solved = reconstruct(shots, factors)
+                truth = truth_for(shots, factors.manifest.board_reflectance)
+                assert truth is not None
+                found.append(psnr(solved.image, truth))
+                warnings += map(str, solved.status.flags)
+            case = {name: each.name for name, each in shown.items()} | {"dose": dose, "exposure_total_s": seconds}
+            cases.append(case | {"psnr_predicted": predicted.psnr_db, "psnr_rendered": float(np.mean(found))})
+            predictions.append(predicted)
+            levels.append(found)
+    judge = np.min if goal.judge == "worst" else np.mean
+    worst, rendered = min(predictions, key=lambda each: each.psnr_db), judge(levels, axis=0)
     return replace(
         candidate,
-        predicted=predicted.psnr_db,
-        causes=dict(predicted.errors.causes),
-        rendered=float(np.mean(found)),
-        scatter=float(np.std(found, ddof=1)),
-        session_s=predicted.session_exposure_s,
-        warnings=tuple(dict.fromkeys(map(str, warnings))),
-        image=image.image,
+        cases=tuple(cases),
+        predicted=float(judge([each.psnr_db for each in predictions])),
+        causes=dict(worst.errors.causes),
+        rendered=float(rendered.mean()),
+        scatter=float(rendered.std(ddof=1)),
+        session_s=worst.session_exposure_s,
+        warnings=tuple(dict.fromkeys(warnings)),
+        image=solved.image,
     )
 
 
@@ -150,16 +165,16 @@ def design(
     aside = replaced(Path(output), (DESIGN,)) if overwrite else nullcontext()
     with aside, output_folder(output, overwrite=same) as folder:
         with job.clock.stage("open scene"):
-            bench = open_bench(asked.scene, camera=asked.camera)
+            bench = open_bench(asked.scene, camera=asked.camera, **asked.shown[0])
         with job.clock.stage("transport"):
-            stand, session_s = stand_of(bench, asked.seed)
+            stand = stand_of(bench, asked.seed)
         with job.clock.stage("search"):
-            every = searches(stand, asked, session_s)
+            every = searches(stand, asked)
         head = {"kind": "design", "versions": versions(), "command": job.command, "scene": str(asked.scene)}
         write_json(folder / DESIGN, {**head, "status": "incomplete"})
         write_text(folder / GOAL, text)
         with job.clock.stage("search"):
-            candidates, complete = run_search(stand, asked, folder, job, session_s, every)
+            candidates, complete = run_search(asked, folder, job, every)
         proved = []
         for number, each in enumerate(candidates):
             job.progress("proof", number / len(candidates))
@@ -167,11 +182,10 @@ def design(
             with job.clock.stage("proof"):
                 proved.append(prove(asked, each, file, job.apart(f"{each.name} ")))
         best, *simple = proved
-        own = every[best.choice]
+        own, code, distances = every[best.choice], best.found.code, asked.scene_distances_mm
+        first = own.objectives[:: len(own.objectives) // len(distances)] if distances else ()
         texts = dict.fromkeys(text for each in proved for text in each.warnings)
         warnings = [f"{', '.join(each.name for each in proved if text in each.warnings)}: {text}" for text in texts]
-        if stand.ambient is not None:
-            warnings.append("The search neglects the light of lamps, which predicted and rendered images have")
         if best.rendered < best.predicted - _SHORT_DB:
             short = f"by {best.predicted - best.rendered:.1f} dB; a cause that the prediction lacks matters"
             warnings.append(f"The rendered image is worse than predicted: {short} in this scene")
@@ -182,9 +196,10 @@ def design(
             warnings.append(f"The design is no better than a simple mask: {known}; take it, or use more seeds")
         found = Design(
             candidates=tuple(proved),
-            bounds=tuple(own.active_bounds(best.found.code)),
-            sensitivity=sensitivity(own, best.found.code),
-            seconds_for_psnr=None if asked.wanted_psnr_db is None else seconds_for(own, best.found.code, asked),
+            bounds=tuple(own.active_bounds(code)),
+            distances={f"{mm:g} mm": one((code, code)).psnr_db for mm, one in zip(distances, first, strict=True)},
+            sensitivity=sensitivity(own, code),
+            seconds_for_psnr=None if asked.wanted_psnr_db is None else seconds_for(own, code, asked),
             complete=complete,
             seconds=job.clock.seconds(),
             output=str(folder),

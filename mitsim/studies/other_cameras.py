@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import cache, partial
 from itertools import product
 from typing import TYPE_CHECKING
@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mitsim.acquire.capture import rendered_psf
-from mitsim.acquire.exposure import Exposer, peak_irradiance, taken_off
+from mitsim.acquire.exposure import Exposer
 from mitsim.bench.apparatus import Apparatus
 from mitsim.bench.request import Exposure
 from mitsim.calibrate.board_session import LitSession, Session
@@ -41,11 +41,11 @@ from mitsim.devices.patterns import PatternFamily, parse_patterns
 from mitsim.devices.sensor import SensorModel
 from mitsim.devices.session import load_recipe
 from mitsim.metrics import psnr, relative_error
-from mitsim.optics.frames import ExpectedFrames, Frame
+from mitsim.optics.frames import Frame
 from mitsim.reconstruct.point_spread import DotClasses, ShiftedLight, solve_iteratively
 from mitsim.reconstruct.solver import Solution, centre_columns, centre_frame, prepare
 from mitsim.report import EQUAL_FRAME, EQUAL_PEAK, IDEALISED, MODELS, RENDERED
-from mitsim.report.lit_scene import IdealCamera, LitScene, Pair, Unexposed
+from mitsim.report.lit_scene import IdealCamera, LitScene, Pair, Unexposed, measured
 from mitsim.report.pages import Mean
 from mitsim.sensor.chain import dn_to_electrons, electrons_from_irradiance, expose, exposure_for_peak
 from mitsim.studies.framework.claims import Gain, Holds, Judged, stated, within
@@ -115,52 +115,38 @@ def _consistent(factors: Places, bench: Apparatus, white: Callable[[float, float
     return found
 
 
-@dataclass(frozen=True, eq=False)
-class MovedMask:
-    """Uniform frames of a scene through a mask at several places, by one of :data:`mitsim.report.MODELS`."""
+Moved = Mapping[tuple[float, float], Unexposed]
+"""Uniform frames by the shift of the mask along rows and columns [mm]."""
 
-    lit: LitScene
-    model: str
-    factors: Places
-    seed: int
-    _formed: dict[tuple[float, float], ExpectedFrames] = field(default_factory=dict)
 
-    def expected_frames(self, row_mm: float, column_mm: float) -> ExpectedFrames:
-        place = row_mm, column_mm
-        if place not in self._formed:
-            bench = move_mask(self.lit.bench, *place)
-            self._formed[place] = self.lit.expected_frames(self.model, bench.family("uniform"), bench=bench)
-        return self._formed[place]
+def through_moved_mask(lit: LitScene, model: str, factors: Places, along: Sequence[float], seed: int) -> Moved:
+    """Return uniform frames of a scene through a mask at all places of a grid, by one of the models of a scene."""
+    uniform, found = lit.bench.family("uniform"), {}
+    for row, column in product(along, repeat=2):
+        sides, own = (factors[row][0], factors[column][1]), integer(seed, "mask", f"{row:g}", f"{column:g}")
+        bench, centre = move_mask(lit.bench, row, column), lit.bench.geometry.centred
+        found[row, column] = Unexposed(lit, model, uniform, sides, centre, own, bench=bench)
+    return found
 
-    def seconds(self, rows_mm: Sequence[float], columns_mm: Sequence[float], exposure: str) -> float:
-        """Return the exposure time [s] of each frame of a grid at equal peak or equal frame."""
-        if exposure == EQUAL_FRAME:
-            return self.lit.uniform_s(self.model)
-        brightest = max(peak_irradiance(self.expected_frames(*place)) for place in product(rows_mm, columns_mm))
-        return Exposure().choose(self.lit.bench.devices, brightest)
 
-    def solve(self, rows_mm: Sequence[float], columns_mm: Sequence[float], seconds: float) -> Solution:
-        left = np.concatenate([self.side(0, place) for place in rows_mm])
-        right = np.concatenate([self.side(1, place) for place in columns_mm])
-        uniform = np.ones((self.lit.bench.n, 1))
-        model = prepare(left, right, uniform, uniform)
-        sums = model.accumulator()
-        with single_threaded_blas():
-            sums.add(np.block([[self.measure(row, column, seconds) for column in columns_mm] for row in rows_mm]), 0, 0)
-            return model.solve(sums)
+def frame_of(one: Unexposed, seconds: float) -> FloatArray:
+    ((frame, _, _),) = measured(one.exposer(seconds), one.family, one.expected)
+    return centre_frame(frame) if one.centre else frame
 
-    def side(self, axis: int, place: float) -> FloatArray:
-        factor = self.factors[place][axis]
-        return centre_columns(factor) if self.lit.bench.geometry.centred else factor
 
-    def measure(self, row_mm: float, column_mm: float, seconds: float) -> FloatArray:
-        bench, expected = self.lit.bench, self.expected_frames(row_mm, column_mm)
-        speckle = self.lit.light.simulation.physics.speckle if self.model == RENDERED else 0.0
-        exposer = Exposer(bench.devices, seconds, integer(self.seed, "mask", f"{row_mm:g}", f"{column_mm:g}"), speckle)
-        family = bench.family("uniform")
-        ((frame, _, _),) = exposer.measurements(family, expected)
-        frame = frame - taken_off(exposer, family, expected)
-        return centre_frame(frame) if bench.geometry.centred else frame
+@single_threaded_blas()
+def solve_moved(moved: Moved, exposure: str) -> tuple[Solution, float]:
+    """Return the solution of all frames together, and the exposure of each [s]: the brightest one fills the well."""
+    seconds = min(each.seconds(exposure) for each in moved.values())
+    rows, columns = (list(dict.fromkeys(side)) for side in zip(*moved, strict=True))
+    sides = [moved[row, columns[0]].sides[0] for row in rows], [moved[rows[0], column].sides[1] for column in columns]
+    centre = moved[rows[0], columns[0]].centre
+    left, right = (np.concatenate([centre_columns(each) if centre else each for each in side]) for side in sides)
+    uniform = np.ones((left.shape[1], 1))
+    model = prepare(left, right, uniform, uniform)
+    sums = model.accumulator()
+    sums.add(np.block([[frame_of(moved[row, column], seconds) for column in columns] for row in rows]), 0, 0)
+    return model.solve(sums), seconds
 
 
 REACH = 15.0
@@ -183,10 +169,9 @@ def _multishot_measure(studio: Studio, point: Point) -> Found:
     images: dict[str, Image] = {}
     if method == SWEPT:
         along = tuple(places[index] for index in GRIDS[side])
-        mask = MovedMask(lit, model, factors, noise_seed)
+        moved = through_moved_mask(lit, model, factors, along, noise_seed)
         for exposure in EXPOSURES:
-            seconds = mask.seconds(along, along, exposure)
-            found = mask.solve(along, along, seconds)
+            found, seconds = solve_moved(moved, exposure)
             flags = flags_of(found.status)
             images[exposure] = Image(found.image, lit.quality(found.image), found.lam, count, seconds, flags)
     else:
@@ -325,8 +310,8 @@ def separable_seconds(bench: Apparatus, k: int) -> float:
 
 
 @cache
-def _psf(file: str | None, variant: str) -> FloatArray:
-    return rendered_psf(_SHAPE, _PITCH_MM, variant) if file is None else load_psf(file, _REDUCE)
+def _psf(file: str | None) -> FloatArray:
+    return rendered_psf(_SHAPE, _PITCH_MM) if file is None else load_psf(file, _REDUCE)
 
 
 def _convolutional_points(scope: Scope) -> Sequence[Point]:
@@ -343,7 +328,7 @@ def _convolutional_points(scope: Scope) -> Sequence[Point]:
 
 def _convolutional_measure(studio: Studio, point: Point) -> Found:
     name, k, seed = point.setup.picture, round(point["patterns"] ** 0.5), int(point["seed"])
-    psf, bench = _psf(point["file"], point.setup.variant), studio.bench(point.setup)
+    psf, bench = _psf(point["file"]), studio.bench(point.setup)
     if name is None:
         truth = studio.lit_scene(point.setup).truth
     else:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from mitsim.core.configuration import locate
+from mitsim.core.configuration import locate, scene_parameters
 from mitsim.core.errors import MitsimError
 from mitsim.devices.patterns import short_name
 from mitsim.report import EQUAL_PEAK, RENDERED
@@ -52,14 +51,11 @@ def _axis(scope: experiment.Scope, knob: str) -> str:
     """Return the name of an axis: the parameter, and its meaning and unit as the scene file's comment states them."""
     if knob in experiment.NO_SCENE:
         return experiment.MEASURES["lambda"][1] if knob == experiment.ASKED else f"{knob} [1]"
-    found = None
+    known: dict[str, str] = {}
     with suppress(OSError, MitsimError):  # parts may be merged where the scene is not
-        text = locate(scope.setup.scene, "scenes", "scene.xml").read_text("utf-8")
-        words = r"(?:(mm|degrees),? )?([^\n$]*?)(?: \[(.+?)\].*?| \(chosen.*?)?"
-        found = re.search(rf'<default name="{re.escape(knob)}"[^>]*>[ \t]*<!-- {words} -->', text)
-    unit = (found and (found[1] or found[3])) or "as in the scene file"
-    unit = re.sub(r"\^(-?\d+)", r"$^{\1}$", unit).replace(" ", "\N{NO-BREAK SPACE}")
-    return f"{knob}: {found[2]} [{unit}]" if found else f"{knob} [{unit}]"
+        found = scene_parameters(locate(scope.setup.scene, "scenes", "scene.xml"))
+        known = {text.partition("=")[0]: words.replace("$", r"\$") for text, words in found}
+    return f"{knob} [{known.get(knob) or 'as in the scene file'}]"
 
 
 def _panels(results: experiment.Results) -> Mapping[str, Figure]:

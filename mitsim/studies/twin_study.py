@@ -29,7 +29,6 @@ from scipy import ndimage
 from mitsim.api.bench import open_bench
 from mitsim.core.arrays import FloatArray
 from mitsim.core.configuration import read_toml, shipped_path, validate
-from mitsim.core.environment import load_variant
 from mitsim.core.errors import MitsimError
 from mitsim.core.images import Preparer, grey_png, read_image
 from mitsim.core.manifests import Digital
@@ -300,9 +299,8 @@ def read_spread(path: Path) -> FloatArray:
     return light[middle[0] - half : middle[0] + half, middle[1] - half : middle[1] + half]
 
 
-def simulated_spreads(count: int, seed: int, variant: str) -> list[FloatArray]:
+def simulated_spreads(count: int, seed: int) -> list[FloatArray]:
     """Return squares of light (count, count) behind random diffusers."""
-    load_variant(variant)
     squares, glass = [], Diffuser()
     slope = _MOVE_MM / (glass.distance_mm * (glass.index - 1))
     for each in range(TRACED):
@@ -365,7 +363,7 @@ def _measure(studio: Studio, point: Point) -> Found:
 
 
 def _measure_diffuser(point: Point, square: FloatArray, seed: int) -> Found:
-    simulated = simulated_spreads(len(square), seed, point.setup.variant)
+    simulated = simulated_spreads(len(square), seed)
     lights = {"measured": square, **{f"simulated {number}": each for number, each in enumerate(simulated, 1)}}
     rows = []
     for name, light in lights.items():

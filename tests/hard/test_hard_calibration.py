@@ -21,11 +21,12 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.exr import write_frame
 from mitsim.devices.camera import centred_edges
 from mitsim.devices.mask import mls_mask
-from mitsim.reconstruct.factors import LARGEST_ERROR, Estimate, estimate_factors
+from mitsim.reconstruct.factors import LARGEST_ERROR, Estimate
 from mitsim.reconstruct.reconstruct import Reconstruction
 from mitsim.report.reconstruct_run import reconstruct
 from tests.robustness import Recorder
 from tests.shadow_factor import scene_factor
+from tests.stripes import estimated
 
 pytestmark = pytest.mark.robustness("Calibration")
 N, PIXELS = 16, 64
@@ -77,7 +78,7 @@ class Camera:
 
         one = np.ones(N)
         noise = float(np.sqrt(self.frame(np.ones((N, N))).mean() / gain)) if electrons else 0.0
-        return estimate_factors(
+        return estimated(
             [signed(np.outer(h, one)) for h in H.T],
             [signed(np.outer(one, h)) for h in H.T],
             H,
@@ -130,7 +131,7 @@ def test_responses_that_cancel_leave_no_factor() -> None:
     """Uniform light alone arrives: the right factor is zero, its error infinite and its rank 0."""
     uniform = np.ones((PIXELS, PIXELS))
     with np.errstate(all="raise"):
-        found = estimate_factors([uniform] + [uniform * 0] * (N - 1), [uniform * 0] * N, H, uniform=uniform)
+        found = estimated([uniform] + [uniform * 0] * (N - 1), [uniform * 0] * N, H)
     assert found.predicted_error[1] == np.inf and found.rank[1] == 0 and not found.ok
 
 

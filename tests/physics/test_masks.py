@@ -33,10 +33,10 @@ from mitsim.api.bench import open_bench
 from mitsim.bench.effects import EFFECTS
 from mitsim.calibrate.board_session import Session
 from mitsim.calibrate.model import calibrate_model, model_of
-from mitsim.calibrate.session_plan import plan_calibration
 from mitsim.core.configuration import shipped_path, validate
 from mitsim.core.errors import MitsimError
 from mitsim.core.job import Job, Limits
+from mitsim.design.session_plan import plan_calibration
 from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.mask import Mask, Plate, mls_mask
 from mitsim.devices.projector import Spectrum

@@ -190,18 +190,12 @@ def factors(call: Call, wide: tuple[object, ...], tmp_path_factory: pytest.TempP
     return calibration
 
 
-@pytest.mark.parametrize(
-    ("how", "part"),
-    [
-        pytest.param(signal.SIGKILL, "light.part.npz", marks=pytest.mark.slow),
-        (signal.SIGINT, "stripes.part.npz"),
-    ],
-)
+@pytest.mark.parametrize("how", [pytest.param(signal.SIGKILL, marks=pytest.mark.slow), signal.SIGINT])
 def test_a_calibration_that_is_stopped_loses_no_finished_part(
-    call: Call, lab: Any, wide: tuple[object, ...], factors: Path, tmp_path: Path, how: signal.Signals, part: str
+    call: Call, lab: Any, wide: tuple[object, ...], factors: Path, tmp_path: Path, how: signal.Signals
 ) -> None:
-    """While light is traced, after it, and between stripes; `reconstruct` does not take it for a calibration."""
-    calibration = tmp_path / "cal"
+    """Between stripes; `reconstruct` does not take it for a calibration."""
+    calibration, part = tmp_path / "cal", "stripes.part.npz"
     done = cut_short(how, part, "calibrate", *wide, "-o", calibration)
     reported = {signal.SIGINT: "mitsim: interrupted" + RESUME}
     assert (done.returncode, done.stderr) == (-how if how == signal.SIGKILL else 128 + how, reported.get(how, ""))

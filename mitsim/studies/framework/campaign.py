@@ -256,7 +256,7 @@ def run_experiment(
             text = f"{left / 60:.0f} min" if left > 90 else f"{left:.0f} s"
             job.progress(f"{study}: {done} of {todo} points, {text} left", done / todo)
 
-    return _complete(study, scope, output, measure)
+    return _complete(study, scope, output, measure, job.command)
 
 
 def merge(parts: Sequence[Path | str], output: Path | str, experiment: str | None = None) -> StudyResult:
@@ -328,7 +328,9 @@ def _all(scope: Scope, output: Path | str, each: Callable[[str, Path], StudyResu
         return result
 
 
-def _complete(study: str, scope: Scope, output: Path | str, fill: Callable[[Store], None]) -> StudyResult:
+def _complete(
+    study: str, scope: Scope, output: Path | str, fill: Callable[[Store], None], command: str | None = None
+) -> StudyResult:
     """Fill a study's folder with points, and write table, claims, figures and page if no point is missing."""
     from mitsim.studies.framework.claims import with_intervals
     from mitsim.studies.framework.panels import section_of, write_page
@@ -358,7 +360,7 @@ def _complete(study: str, scope: Scope, output: Path | str, fill: Callable[[Stor
         claims = tuple(experiment.judge(results))
         figures = write_figures(folder, experiment.draw(results), scope.style)
         files.write_text(folder / f"{name}.csv", results.frame.to_csv(index=False))
-        section = section_of(experiment, study, claims, figures, results)
+        section = section_of(experiment, claims, figures, results, command)
         result = replace(
             result,
             rows=tuple(results.rows),
@@ -368,7 +370,7 @@ def _complete(study: str, scope: Scope, output: Path | str, fill: Callable[[Stor
             warnings=section.warnings,
         )
         write_page([section], folder / f"{name}.html", section.title, result.headline)
-        files.write_json(place, {**head, "status": "complete", **result.payload()})
+        files.write_json(place, {**head, "status": "complete", "command": command, **result.payload()})
     return result
 
 

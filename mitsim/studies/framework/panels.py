@@ -32,7 +32,7 @@ from mitsim.studies.framework.claims import (
     value_name,
     with_unit,
 )
-from mitsim.studies.framework.experiment import HEADS, IMAGE, KNOBS, TEST_IMAGES, TRUTH, Claim, Results, Setup, Study
+from mitsim.studies.framework.experiment import HEADS, IMAGE, KNOBS, TEST_IMAGES, TRUTH, Claim, Results, Study
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -358,7 +358,10 @@ class Part:
 
 @dataclass(frozen=True)
 class Section:
-    """One study on a page; ``pictures`` has data URI and width [pixels] of figures by file name."""
+    """One study on a page; ``pictures`` has data URI and width [pixels] of figures by file name.
+
+    ``pages`` has the contents of further pages by their places.
+    """
 
     name: str
     title: str
@@ -372,37 +375,25 @@ class Section:
     note: str = ""
     about: str = ""
     count: str = ""
-    command: str = ""
+    command: str | None = None
     quick: bool = False
     prints: int = 0
     scene: str = ""
     camera: str = ""
+    pages: Mapping[str, str] = field(default_factory=dict)
 
 
 def section_of(
-    study: Study, name: str, claims: Sequence[Claim], figures: Mapping[str, Figure], results: Results
+    study: Study, claims: Sequence[Claim], figures: Mapping[str, Figure], results: Results, command: str | None = None
 ) -> Section:
-    """Return the section of a study's page; ``name`` is the study's on the command line."""
+    """Return the section of a study's page; ``command`` made its points, None if it was not a command line."""
     scope, setup = results.scope, results.scope.setup
     prints = sorted({str(row.get("picture")) for row in results.rows} & set(TEST_IMAGES))
     of = f" of the test image{'s' if len(prints) > 1 else ''} {', '.join(prints)} of scikit-image" if prints else ""
     accuracies = sorted({point.setup.accuracy for point in study.points(scope)} if study.traced else ())
     named = " or ".join(f"{each:g}" for each in accuracies)
     good = f"; frames before noise asked to be good to {named} (relative rms)" if accuracies else ""
-    given: list[tuple[str, Any]] = [
-        ("--camera", setup.camera), ("--projector", setup.projector),
-        *(("-D", f"{name}={value}") for name, value in setup.parameters),
-        *(("--over", f"{name}={','.join(values)}") for name, values in scope.sweep),
-        ("--measure", ",".join(scope.measures)),
-        ("--patterns", scope.patterns if scope.patterns != type(scope).patterns else None),
-        ("--recipe", scope.recipe), ("--data", scope.data), ("--seed", scope.seeds[0]),
-        ("--seeds", len(scope.seeds) if len(scope.seeds) > 1 else None),
-        ("--style", scope.style if scope.style != type(scope).style else None),
-        ("--variant", setup.variant if setup.variant != Setup.variant else None),
-    ]  # fmt: skip
     scene = scene_name(Path(setup.scene))
-    flags = {"--allow-outside-files": setup.outside, "--quick": scope.quick}
-    options = [*(f"{option} {value}" for option, value in given if value), *(flag for flag, on in flags.items() if on)]
     return Section(
         study.name,
         title=study.title.replace(KNOBS, " and ".join(name for name, _ in scope.sweep)),
@@ -418,7 +409,7 @@ def section_of(
         note=study.note,
         about=study.about,
         count=f"{len(results.rows)} measurement{'s' * (len(results.rows) > 1)}{of}{good}",
-        command=" ".join(["mitsim study", name, *([] if any(scope.pictures) else [setup.scene]), *options]),
+        command=command,
         quick=scope.quick,
         prints=len(prints),
         scene=f"{len(prints)} test image{'s' * (len(prints) > 1)} on {scene}" if prints else scene,

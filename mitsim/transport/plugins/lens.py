@@ -52,7 +52,7 @@ import scipy
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import MitsimError
 from mitsim.core.seeds import integer, stream
-from mitsim.transport.plugins.base import Surface, host_values, vectors
+from mitsim.transport.plugins.base import Surface
 
 PLUGIN = "mitsim_projector"
 
@@ -127,8 +127,6 @@ def plugin_class() -> type:
 # grad h(x), with h the thickness, so that the irradiance is 1 / |det(1 + d (n - 1) Hess h)|, summed over all x that
 # land there: the caustics of a diffuser.
 
-_THICKNESS_MM = 1.0
-_CLEAR_MM = 0.05
 _RAYS_AT_ONCE = 2**22
 _VERTICES = 12
 
@@ -174,33 +172,6 @@ class Diffuser:
     index: float = 1.5
     distance_mm: float = 8.0
 
-    def scene(self) -> mi.Scene:
-        relief, count = self.relief, len(self.relief.height_mm)
-        across = np.linspace(-relief.side_mm / 2, relief.side_mm / 2, count)
-        x, y = np.meshgrid(across, across, indexing="ij")
-        places = np.stack([x, y, self.distance_mm - relief.height_mm], axis=-1)
-        # Out of the glass, towards the sensor.
-        normals = np.stack([-relief.slope_x, -relief.slope_y, -np.ones_like(x)], axis=-1)
-        normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
-        corner = (np.arange(count - 1)[:, None] * count + np.arange(count - 1)).ravel()
-        beside, above = corner + count, corner + 1
-        faces = np.concatenate(
-            [np.stack(each, axis=1) for each in ((corner, above, beside), (beside, above, beside + 1))]
-        )
-        glass, properties = {"type": "dielectric", "int_ior": self.index, "ext_ior": 1.0}, mi.Properties()
-        properties["bsdf"] = mi.load_dict(glass)
-        mesh = mi.Mesh("relief", count * count, len(faces), has_vertex_normals=True, props=properties)
-        held = mi.traverse(mesh)
-        held["vertex_positions"] = mi.Float(places.astype(np.float32).ravel())
-        held["vertex_normals"] = mi.Float(normals.astype(np.float32).ravel())
-        held["faces"] = mi.UInt32(faces.astype(np.uint32).ravel())
-        held.update()
-        side, top = 2 * relief.side_mm, self.distance_mm + _THICKNESS_MM
-        flat = mi.ScalarTransform4f().translate([0, 0, top]).scale([side, side, 1])
-        return mi.load_dict(
-            {"type": "scene", "flat": {"type": "rectangle", "to_world": flat, "bsdf": glass}, "relief": mesh}
-        )
-
 
 def point_spread(
     diffuser: Diffuser, shape: tuple[int, int], pitch_mm: float, rays: int = 4096, seed: int = 0
@@ -209,35 +180,27 @@ def point_spread(
 
     ``rays`` is the number along an axis.
     """
-    scene, side = diffuser.scene(), diffuser.relief.side_mm
-    rows, columns = shape
-    above = diffuser.distance_mm + _THICKNESS_MM + 1.0
-    unit = mi.Vector3f(0, 0, -1)
-    # Light instead of radiance, and only its refracted part.
-    context = mi.BSDFContext(mi.TransportMode.Importance, mi.BSDFFlags.DeltaTransmission)
+    relief, (rows, columns), n = diffuser.relief, shape, diffuser.index
+    side, cells = relief.side_mm, len(relief.height_mm) - 1
     light = np.zeros(rows * columns)
     band = max(1, _RAYS_AT_ONCE // rays)
     for first in range(0, rays, band):
         count = min(band, rays - first)
         jitter = stream(integer(seed, "diffuser rays"), first).random((2, count, rays))
-        x = ((np.arange(first, first + count)[:, None] + jitter[0]) / rays - 0.5) * side
-        y = ((np.arange(rays)[None, :] + jitter[1]) / rays - 0.5) * side
-        places = np.stack([x.ravel(), y.ravel(), np.full(x.size, above)])
-        ray, part, active = mi.Ray3f(mi.Point3f(places.astype(np.float32)), unit), mi.Float(1), mi.Bool(True)
-        for _ in range(2):
-            crossing = scene.ray_intersect(ray, active)
-            active &= crossing.is_valid()
-            turned, weight = crossing.bsdf().sample(context, crossing, 0.5, mi.Point2f(0.5), active)
-            part *= weight[0]  # glass without colour
-            # Not Mitsuba's own start, which leaves the ray's line and loses light at the relief's edge.
-            along_ray = crossing.to_world(turned.wo)
-            ray = mi.Ray3f(crossing.p + along_ray * _CLEAR_MM, along_ray)
-        active &= ray.d.z < 0
-        place = vectors(ray(-ray.o.z / ray.d.z), places.shape[1])
-        part = host_values(mi.Float(mi.UInt32(active)) * part, places.shape[1])
-        row = np.floor(rows / 2 - place[:, 1] / pitch_mm)
-        column = np.floor(columns / 2 - place[:, 0] / pitch_mm)
-        seen = (row >= 0) & (row < rows) & (column >= 0) & (column < columns) & (part > 0)
+        at = (np.arange(first, first + count)[:, None] + jitter[0]) / rays, (np.arange(rays) + jitter[1]) / rays
+        height, *slopes = (
+            scipy.ndimage.map_coordinates(part, np.multiply(at, cells), order=1)
+            for part in (relief.height_mm, relief.slope_x, relief.slope_y)
+        )
+        # Cosines to the relief's normal in glass and in air, and Fresnel's reflectances of both polarisations.
+        glass = 1 / np.sqrt(1 + np.square(slopes).sum(axis=0))
+        air = np.sqrt(np.maximum(1 - n**2 * (1 - glass**2), 0))
+        reflected = np.square([(n * glass - air) / (n * glass + air), (n * air - glass) / (n * air + glass)])
+        part = (1 - reflected.mean(axis=0)) * (1 - ((n - 1) / (n + 1)) ** 2) * (air > 0)
+        bend = (diffuser.distance_mm - height) * glass * (n * glass - air) / (air * glass + n * (1 - glass**2))
+        y, x = ((place - 0.5) * side + bend * slope for place, slope in zip(at[::-1], slopes[::-1], strict=True))
+        row, column = (np.floor(size / 2 - place / pitch_mm) for size, place in ((rows, y), (columns, x)))
+        seen = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
         index = (row[seen] * columns + column[seen]).astype(np.int64)
         light += np.bincount(index, part[seen], minlength=rows * columns)
     return np.asarray(light.reshape(shape) * (side / rays / pitch_mm) ** 2)

@@ -79,11 +79,11 @@ def test_what_is_no_image_is_refused_in_a_line(tmp_path: Path) -> None:
         with pytest.raises(MitsimError, match=message):
             read_image(tmp_path / name, channel)
     (tmp_path / "bad.npy").write_text("no array")
-    with pytest.raises(MitsimError, match="not an array"):
+    with pytest.raises(MitsimError, match="cannot be read: damaged"):
         read_image(tmp_path / "bad.npy")
     for values in (np.full((2, 2), 1 + 1j), np.full((2, 2), "1")):  # (planted: imaginary parts dropped)
         np.save(tmp_path / "bad.npy", values)
-        with pytest.raises(MitsimError, match=r"not an array .* no real numbers"):
+        with pytest.raises(MitsimError, match="rows x columns of numbers are needed"):
             read_image(tmp_path / "bad.npy")
     with pytest.raises(MitsimError, match="an array has no channel 'R'"):
         read_image(tmp_path / "bad.npy", "R")
@@ -110,22 +110,8 @@ def test_a_png_holds_16_bits(tmp_path: Path) -> None:
 
 
 def test_an_array_that_claims_is_held_against_its_file(tmp_path: Path) -> None:
-    """Sparse, cut in its header, or of more pixels than a sensor has. (Planted: numpy's reader, which raises a
-    TokenError for the second.)"""
+    """It is read as other pictures are (tests/unit/core/test_imagefile.py). (Planted: numpy's reader.)"""
     np.save(tmp_path / "image.npy", IMAGE)
-    whole = (tmp_path / "image.npy").read_bytes()
-    for content, size, words in (
-        (whole, 1 << 40, "and 1099511627648 follow"),
-        (whole.replace(b"'shape': (", b"'shape'  (("), len(whole), "not an array of numbers"),
-        (whole.replace(b"}", b"{"), len(whole), "header is damaged|not an array"),
-        (whole[:-1], len(whole) - 1, "its header claims"),
-    ):
-        (tmp_path / "bad.npy").write_bytes(content)
-        os.truncate(tmp_path / "bad.npy", size)
-        with pytest.raises(MitsimError, match=words):
-            read_image(tmp_path / "bad.npy")
-    np.lib.format.open_memmap(tmp_path / "wide.npy", "w+", np.float64, (1, 20000)).flush()
-    np.lib.format.open_memmap(tmp_path / "large.npy", "w+", np.uint8, (8193, 8192)).flush()
-    for name in ("wide", "large"):
-        with pytest.raises(MitsimError, match="at most 16384 pixels a side and 67108864 in all"):
-            read_image(tmp_path / f"{name}.npy")
+    os.truncate(tmp_path / "image.npy", 1 << 40)
+    with pytest.raises(MitsimError, match="and 1099511627648 follow"):
+        read_image(tmp_path / "image.npy")

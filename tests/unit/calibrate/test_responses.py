@@ -218,17 +218,17 @@ class Kept(Checkpoint):
 
     def __init__(self) -> None:
         super().__init__()
-        self.parts: dict[str, dict[str, npt.NDArray[np.float64]]] = {}
+        self.part: dict[str, npt.NDArray[np.float64]] | None = None
         self.left = 0
 
-    def save(self, name: str, arrays: Mapping[str, npt.ArrayLike]) -> None:
-        self.parts[name] = {key: np.array(value) for key, value in arrays.items()}
+    def save(self, arrays: Mapping[str, npt.ArrayLike]) -> None:
+        self.part = {key: np.array(value) for key, value in arrays.items()}
         self.left -= 1
         if self.left == 0:
             raise KeyboardInterrupt
 
-    def load(self, name: str) -> dict[str, npt.NDArray[np.float64]] | None:
-        return self.parts.get(name)
+    def load(self) -> dict[str, npt.NDArray[np.float64]] | None:
+        return self.part
 
 
 @pytest.mark.parametrize("kinds", [(NOISY,), (NOISE_FREE,), (NOISY, NOISE_FREE)])
@@ -243,7 +243,7 @@ def test_a_resumed_estimate_is_the_same_to_the_bit(mode: str, kinds: tuple[str, 
         with pytest.raises(KeyboardInterrupt):
             estimates(lit, Job(), kinds, kept)
         for kind in kinds:
-            done = [int(kept.parts["stripes"][f"{kind}_{side}_done"]) for side in SIDES]
+            done = [int((kept.part or {})[f"{kind}_{side}_done"]) for side in SIDES]
             assert done == [[8, 1], [16, 1], [16, 8], [16, 16]][life]
     again, _, _ = estimates(lit, Job(), kinds, kept)
     for ours, theirs in zip(again, whole, strict=True):

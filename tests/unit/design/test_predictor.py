@@ -111,17 +111,33 @@ def test_ambient_light_adds_shot_noise_and_that_of_its_frame() -> None:
 
 
 def test_noise_of_factors_is_propagated_through_either_side() -> None:
+    """Its mean squared error, and the scatter of that between sessions: by its own square, if the noise is large, and
+    by its product with other noise, if it is small. (Planted: either term of the scatter halved; one
+    factor's alone; noise or lambda of the first factors kept.)
+    """
     scene, (left, right) = by_pixel(PRINT), camera().factors
-    expected = 0.0
+    moved = []
     for row, pixel in product(range(M), range(N)):
         error = np.zeros((M, N))
         error[row, pixel] = 1.0
-        for deviation, first, second in ((0.02, error, right), (0.05, left, error)):
+        for deviation, first, second in ((0.2, error, right), (0.5, left, error)):
             lit = [np.outer(DOTS[:, i], DOTS[:, j]) * scene for i, j in product(range(2), repeat=2)]
-            moved = np.asarray([first @ each @ second.T for each in lit]).reshape(2, 2, M, M)
-            expected += deviation**2 * float(np.square(solved(moved, DOTS)).mean())
-    found = causes(Scene(PRINT), Noise(1.0, factors=(0.02, 0.05)))
-    assert found[predictor.SESSION] == pytest.approx(expected, rel=1e-9)
+            moved.append(deviation * np.asarray([first @ each @ second.T for each in lit]).reshape(2, 2, M, M))
+    images = solved(np.asarray(moved)).reshape(len(moved), -1)
+    found = causes(Scene(PRINT), Noise(1.0, factors=(0.2, 0.5)))
+    assert found[predictor.SESSION] == pytest.approx(np.square(images).sum() / N**2, rel=1e-9)
+    model = Predictor(camera(), (DOTS, DOTS), Scene(PRINT), Noise(1.0, factors=(0.2, 0.5)))
+    left_basis, right_basis = model.prepared.left.basis, model.prepared.right.basis
+    moved_by = (left_basis.T @ images.reshape(-1, N, N) @ right_basis).reshape(len(images), -1)
+    session, errors = moved_by.T @ moved_by, model._by_coefficient(LAM)
+    others = np.sum([each for name, each in errors.items() if name != predictor.SESSION], axis=0)
+    terms = 2 * np.square(session).sum(), 4 * np.vdot(session.diagonal(), others.ravel())
+    assert min(terms) > 0.05 * sum(terms)
+    assert model.session_scatter(LAM) == pytest.approx(sum(terms) ** 0.5 / N**2 / model.errors(LAM).total, rel=1e-9)
+    _ = model.errors()  # and other factors take nothing of it
+    anew = Predictor(camera(), (DOTS, DOTS), Scene(PRINT), Noise(1.0, factors=(0.3, 0.1))).errors()
+    other = model.calibrated((0.3, 0.1)).errors()
+    assert other.causes == anew.causes and other.lam == anew.lam
 
 
 def test_errors_without_noise_are_those_of_the_solved_image() -> None:

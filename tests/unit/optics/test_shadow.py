@@ -32,8 +32,8 @@ from mitsim.optics.shadow import (
     geometric_terms,
 )
 from mitsim.optics.terms import best_term, lacking, shadow_terms
-from mitsim.reconstruct.factors import estimate_factors
 from tests.shadow_factor import scene_factor, shadow_factor, steps_of
+from tests.stripes import estimated
 
 
 def test_a_product_holds_at_every_point() -> None:
@@ -206,7 +206,7 @@ def test_what_factors_of_stripes_lack_is_the_rest_of_the_operator(count: int) ->
         [sum(left @ shown @ right.T for left, right in bright) for shown in shot]
         for shot in (np.stack([np.outer(h, np.ones(4)) for h in signs.T]), [np.outer(np.ones(4), h) for h in signs.T])
     )
-    found = estimate_factors(horizontal, vertical, signs)
+    found = estimated(horizontal, vertical, signs)
     whole = sum(np.einsum("ir,jc->irjc", *term) for term in bright)
     rest = whole - np.einsum("ir,jc->irjc", found.left, found.right)
     lacks = lacking(terms, found.left, found.right)

@@ -13,8 +13,9 @@ from mitsim.bench.request import Request
 from mitsim.core.errors import MitsimError
 from mitsim.core.manifests import CalibrationManifest
 from mitsim.devices.patterns import PatternFamily, parse_patterns
-from mitsim.reconstruct.factors import Factors, estimate_factors, load_calibration, rank_above_noise
+from mitsim.reconstruct.factors import Factors, load_calibration, rank_above_noise
 from mitsim.reconstruct.solver import Status, Verdict
+from tests.stripes import estimated
 
 N, ROWS, COLUMNS = 12, 20, 17
 FAMILIES = ("uniform", "dots:3", "dots:5", "hadamard:4", "random:3")
@@ -89,7 +90,7 @@ def test_saved_and_loaded_they_are_the_same(tmp_path: Path) -> None:
     left, right = rng.random((9, 4)) + np.eye(9, 4), rng.random((8, 4)) + np.eye(8, 4)
     horizontal = [np.outer(left @ column, right.sum(axis=1)) for column in signs.T]
     vertical = [np.outer(left.sum(axis=1), right @ column) for column in signs.T]
-    memory = Factors.of(estimate_factors(horizontal, vertical, signs), CalibrationManifest(camera={"name": "bench"}))
+    memory = Factors.of(estimated(horizontal, vertical, signs), CalibrationManifest(camera={"name": "bench"}))
     memory.save(tmp_path / "cal")
     disk = load_calibration(tmp_path / "cal")
     assert np.array_equal(disk.left, memory.left) and np.array_equal(disk.right, memory.right)

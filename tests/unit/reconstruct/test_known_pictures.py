@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -15,11 +16,11 @@ from mitsim import calibrate_known, load_calibration, load_run, reconstruct
 from mitsim.core.colour_files import CALIBRATION, read_colours
 from mitsim.core.errors import MitsimError
 from mitsim.core.exr import write_frame
-from mitsim.core.images import Preparer, orient
+from mitsim.core.images import ORIENTATIONS, Preparer, orient
 from mitsim.core.manifests import Digital
 from mitsim.core.picture_files import Preparation
 from mitsim.reconstruct.factors import Factors
-from mitsim.reconstruct.known_pictures import TURNS, guess_noise, plane_offsets
+from mitsim.reconstruct.known_pictures import guess_noise, plane_offsets
 from mitsim.reconstruct.solver import Verdict
 from tests.known_camera import PLANES, SCALES, KnownCamera, factor_error, write_known
 
@@ -51,18 +52,18 @@ def test_planted_codes_come_back(tmp_path: Path, pictures: int, patterns: str, l
 
 @pytest.mark.parametrize("name", ["mirrored", "upside down"])
 def test_pictures_may_lie_any_way_and_images_lie_as_they_do(tmp_path: Path, name: str) -> None:
-    camera = KnownCamera(2)
-    factors = one(camera.write_session(tmp_path, 3, TURNS[name]), tmp_path / "cal")
+    camera, turn = KnownCamera(2), partial(orient, orientation=ORIENTATIONS[name])
+    factors = one(camera.write_session(tmp_path, 3, turn), tmp_path / "cal")
     assert factors.manifest.result["orientation"] == name
     assert factors.manifest.result["orientation_margin"] > 0.004
     scene = camera.picture()
-    run = camera.write_run(tmp_path / "other", scene, "dots:2", turn=TURNS[name])
+    run = camera.write_run(tmp_path / "other", scene, "dots:2", turn=turn)
     image = reconstruct(load_run(run), load_calibration(tmp_path / "cal")).image
     assert np.corrcoef(image.ravel(), scene.ravel())[0, 1] > 0.8
 
 
 def test_transposed_pictures_are_refused_by_what_to_do(tmp_path: Path) -> None:
-    listed = KnownCamera(2).write_session(tmp_path, 3, TURNS["transposed, mirrored"])
+    listed = KnownCamera(2).write_session(tmp_path, 3, partial(orient, orientation=6))
     with pytest.raises(MitsimError, match=r"lie transposed.* before the camera.*save the pictures transposed"):
         one(listed, tmp_path / "cal")
     assert not (tmp_path / "cal").exists()

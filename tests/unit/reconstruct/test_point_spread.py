@@ -19,7 +19,7 @@ import mitsim as ms
 from mitsim.cli import app
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.exr import read_frame
-from mitsim.core.images import lightness, read_image
+from mitsim.core.images import lightness, read_image, reduce_frame
 from mitsim.core.manifests import Digital, Patterns, RunHead, RunManifest
 from mitsim.core.runs import Capture, Recorder, frame_name
 from mitsim.devices.patterns import parse_patterns
@@ -136,11 +136,11 @@ def test_half_the_size_sees_half_the_frame() -> None:
         assert half.sensor == (40, 41) and half.half_size() is None
         rows, columns = np.mgrid[: half.scene[0], : half.scene[1]]
         scene = 1 + np.sin(rows / 6) * np.cos(columns / 7)
-        seen, expected = ps.reduce_frame(light.image_of(light.double(scene))[0], 2), half.image_of(scene)[0]
+        seen, expected = reduce_frame(light.image_of(light.double(scene))[0], 2), half.image_of(scene)[0]
         inside = np.s_[5:-5, 5:-5]
         assert np.abs(seen - expected)[inside].max() < 4e-3 * np.ptp(expected)
     assert LIGHTS[2].half_size() is None
-    np.testing.assert_array_equal(ps.reduce_frame(np.arange(12.0).reshape(3, 4), 2), [[2.5, 4.5]])
+    np.testing.assert_array_equal(reduce_frame(np.arange(12.0).reshape(3, 4), 2), [[2.5, 4.5]])
 
 
 @pytest.mark.parametrize(

@@ -69,7 +69,7 @@ def sums_of(shown: Frames, pairs: bool = True) -> tuple[StripeSums, StripeSums]:
     for own in sums:
         for index in range(1, N):
             response, both = pair(own.side, index)
-            own.put(own.fit_response(response, index, both))
+            own.put(own.fit_response(response, both))
     return sums
 
 

@@ -11,7 +11,7 @@ from PIL import Image
 
 import mitsim as ms
 from mitsim.core.errors import MitsimError
-from mitsim.core.images import read_reflectance
+from mitsim.core.images import fit_square, read_reflectance
 from mitsim.scene.outline import Outline
 
 TETRAHEDRON = "v 0 0 0\nv 10 0 0\nv 5 20 3\nv 4 2 9\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n"
@@ -43,6 +43,12 @@ def test_numbers_are_reflectances_whichever_file_holds_them(kind: str, tmp_path:
     else:
         Image.fromarray(codes).save(path)
     assert_allclose(read_reflectance(path), codes / 255, atol=1e-7)
+
+
+def test_large_pictures_are_reduced_by_means_and_centred(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Blocks at the ends are smaller. (Planted: blocks at the ends left out; sums instead of means.)"""
+    monkeypatch.setattr("mitsim.core.images._MOST_SIDE", 3)
+    assert_allclose(fit_square(np.arange(15.0).reshape(3, 5)), [[3, 5, 6.5], [10.5, 12.5, 14], [0, 0, 0]])
 
 
 def test_a_picture_on_the_sheet_is_the_truth(variant: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -145,13 +145,13 @@ def test_all_studies_are_sharded_and_merged_too(
     assert contents(tmp_path / "whole" / TOY) == contents(whole[1])
 
 
-def test_a_page_of_several_has_each_claim_under_its_command(whole: Whole, tmp_path: Path) -> None:
-    """(Planted: one table without commands.)"""
+def test_a_page_of_several_has_each_claim_under_its_study(whole: Whole, tmp_path: Path) -> None:
+    """(Planted: one table without studies.)"""
     section = whole[0].section
     assert section
-    page = write_page([section, replace(section, command="mitsim study other")], tmp_path / "page.html", "Two")
+    page = write_page([section, replace(section, name="other")], tmp_path / "page.html", "Two")
     summary = page.read_text().split("<h2")[1]
-    first, second = (summary.index(f"<code>{each}</code>") for each in (section.command, "mitsim study other"))
+    first, second = (summary.index(f'<a href="#{each}">') for each in (section.name, "other"))
     claim = summary.index("Two squared is four")
     assert first < claim < second < summary.index("Two squared is four", claim + 1)
 
@@ -294,7 +294,7 @@ def test_a_cluster_gives_the_same(run: Run, tmp_path: Path) -> None:
 
 def test_a_figure_without_axes_is_not_written(tmp_path: Path) -> None:
     """(Planted: it is.)"""
-    figures = {"toy.png": plots.singular_values({"a": [2.0, 1.0]}), "none.png": Figure()}
+    figures = {"toy.png": plots.image_grid({"": [(np.zeros((2, 2)), "")]}, ["a"]), "none.png": Figure()}
     assert [*campaign.write_figures(tmp_path, figures)] == ["toy.png"]
     assert {path.name for path in tmp_path.iterdir()} == {"toy.png", "toy.svg", "toy.pdf"}
 

@@ -3,6 +3,8 @@
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -12,7 +14,10 @@ from mitsim.bench.request import Request
 from mitsim.core.errors import MitsimError
 from mitsim.core.job import Job
 from mitsim.light.plan import Plan
-from mitsim.studies.demo import demo, scene_line
+from mitsim.metrics import Quality
+from mitsim.report import EQUAL_PEAK, IDEALISED, RENDERED
+from mitsim.studies.demo import demo, doubts, results_of, scene_line, trust_of, verdict
+from mitsim.studies.framework.studio import Image
 
 pytestmark = pytest.mark.usefixtures("draft_figures")
 
@@ -66,3 +71,61 @@ def test_what_does_not_fit_is_refused_before_an_earlier_demo_is_removed(
     with pytest.raises(MitsimError, match="full_well_e is inf"):
         demo(bottomless, earlier, Request.of(patterns="dots:2"))
     assert (earlier / "report.html").read_text() == "yesterday's"
+
+
+# -------- The verdict
+
+
+def images(ours: float, theirs: float, cause: str = "") -> dict[tuple[str, str, str], Image]:
+    """Images of 49 dots and of uniform light with stated PSNR; the idealised gain is 12.9 dB."""
+
+    def image(decibel: float, cause: str = "") -> Image:
+        stated: Any = {"flagged": bool(cause), "reason": cause}, {"cause": cause}
+        return Image(np.ones((4, 4)), Quality(decibel, None), 1.0, 1, 1.0, *stated)
+
+    return {
+        ("dots:7", RENDERED, EQUAL_PEAK): image(ours, cause), ("uniform", RENDERED, EQUAL_PEAK): image(theirs),
+        ("dots:7", IDEALISED, EQUAL_PEAK): image(36.4), ("uniform", IDEALISED, EQUAL_PEAK): image(23.5),
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("ours", "theirs", "cause", "headline"),
+    [
+        (31.8, 18.7, "", "49 dots beat uniform by 13.1 dB"),
+        (31.8, 18.7, "depth", "49 dots beat uniform by 13.1 dB, but part of their light fits no image"),
+        (19.0, 18.7, "", "49 dots: 0.3 dB above uniform"),
+        (18.0, 18.7, "depth", "49 dots: 0.7 dB below uniform"),
+        (-42.0, -65.3, "", "49 dots: no image, -42.0 dB"),
+    ],
+)
+def test_a_gain_over_nothing_is_no_gain(ours: float, theirs: float, cause: str, headline: str) -> None:
+    """A mirror's demo said that 9 dots beat uniform by 23.3 dB, of images at -42 and -65 dB. (Planted: "beat" by 0.3
+    dB, and nothing of a misfit.)"""
+    found = images(ours, theirs, cause)
+    assert verdict(found, "dots:7") == (
+        headline,
+        f"{ours:.1f} against {theirs:.1f} dB PSNR, rendered light and calibrated factors. The idealised model says "
+        "+12.9 dB.",
+    )
+    stated = doubts(found, "dots:7")
+    assert (f"49 dots: {cause}" in stated) == bool(cause) and any("no image" in text for text in stated) == (ours < 0)
+    assert verdict(found, "uniform")[0] == f"Uniform: {theirs:.1f} dB", "nothing to compare with"
+
+
+def test_trust_compares_stated_and_actual_errors() -> None:
+    """10 000 draws of normal noise of twice the stated deviation: 67 % lie within 1.96 stated ones, to 2 %. (Planted:
+    the error held against one uncertainty.)"""
+    error = 0.02 * np.random.default_rng(3).standard_normal((100, 100))
+    image: Any = SimpleNamespace(image=0.5 + error, uncertainty=np.full((100, 100), 0.01), misfit=None)
+    found = trust_of(image, np.full((100, 100), 0.5))
+    assert found["uncertainty"] == pytest.approx(0.01) and found["rms_error"] == pytest.approx(0.02, rel=0.03)
+    assert found["within_95"] == pytest.approx(0.673, abs=0.02) and found["cause"] is None
+    assert trust_of(cast(Any, SimpleNamespace(uncertainty=None)), error) == {}
+
+
+def test_rows_of_the_page_have_their_images() -> None:
+    """(Planted: the image of another family.)"""
+    results = results_of(images(31.8, 18.7), np.zeros((4, 4)))
+    assert [row["psnr_db"] for row in results.rows] == [31.8, 18.7, 36.4, 23.5]
+    assert all(results.array(row) is not None for row in results.rows)

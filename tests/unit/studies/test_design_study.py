@@ -9,10 +9,15 @@ from typing import Any
 import numpy as np
 import pytest
 
+from mitsim.core.job import Job
+from mitsim.design.goal import Goal
+from mitsim.design.masks import Candidate, Choice
+from mitsim.design.search import Found
 from mitsim.report import RENDERED
 from mitsim.studies.design_study import MASKS, PREDICTED
 from mitsim.studies.framework.experiment import TRUTH, Point, Results, Scope, Setup, find_experiment
 from mitsim.studies.framework.studio import Studio
+from mitsim.studies.mask_design import prove
 
 STUDY = find_experiment("design")
 
@@ -35,7 +40,17 @@ def test_a_point_has_each_mask_predicted_and_rendered(shared_scene: Callable[...
     point = Point.of(setup, patterns="dots:4", dose=0.1, evaluations=10, seed=1)
     with Studio() as studio:
         found = STUDY.measure(studio, point)
-        full = studio.bench(setup).predict("dots:4")
+        bench = studio.bench(setup)
+        full = bench.predict("dots:4")
+        goal = Goal(scene=setup.scene, exposure_total_s=1.0, doses=(1.0, 0.1), judge="worst", seeds=2, accuracy=1e-2)
+        exposures = (full.frames * full.exposure_s, 1.6 * full.exposure_s)
+        choice, code = Choice(0.06, 2.0, "dots:4"), Found("own", np.ones(3), 1.0, 0)
+        proved = prove(goal, Candidate("own", choice, code, exposures), Path("camera.toml"), Job(), bench)
+    bright, dim = proved.cases
+    assert (bright["dose"], dim["dose"], dim["exposure_total_s"]) == (1.0, 0.1, exposures[1])
+    assert bright["psnr_rendered"] > proved.rendered == pytest.approx(dim["psnr_rendered"])
+    assert bright["psnr_predicted"] > proved.predicted == dim["psnr_predicted"]
+    assert bright["psnr_predicted"] == pytest.approx(full.psnr_db)
     rows: dict[tuple[Any, Any], Any] = {(row["mask"], row["model"]): row for row in found.rows}
     assert [*rows] == [(mask, model) for model in (PREDICTED, RENDERED) for mask in MASKS]
     for model in (PREDICTED, RENDERED):

@@ -12,9 +12,9 @@ from mitsim.devices.projector import Spectrum
 from mitsim.metrics import relative_error
 from mitsim.optics.shadow import Directions
 from mitsim.optics.terms import best_term, centre_terms, shadow_terms
-from mitsim.reconstruct.factors import estimate_factors
 from mitsim.report.lit_scene import IdealCamera
 from mitsim.sensor.chain import electrons_from_irradiance
+from tests.stripes import estimated
 
 N = 16
 
@@ -72,7 +72,7 @@ def test_calibration_finds_the_best_separable_factors(bench: Bench) -> None:
     ones = np.ones(N)
     stripes = [[sum(np.outer(a @ h, b @ ones) for a, b in camera.terms) for h in signs.T]]
     stripes.append([sum(np.outer(a @ ones, b @ h) for a, b in camera.terms) for h in signs.T])
-    found = estimate_factors(*stripes, signs, centre=camera.centre)
+    found = estimated(*stripes, signs, centre=camera.centre)
     left, right = camera.factors
     operator = np.einsum("ir,jc->irjc", left, right)
     difference = relative_error(np.einsum("ir,jc->irjc", found.left, found.right), operator)

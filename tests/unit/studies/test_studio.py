@@ -9,9 +9,10 @@ import pytest
 
 import mitsim as ms
 from mitsim.core.errors import MitsimError
+from mitsim.core.images import reduce_frame
 from mitsim.devices.mask import mls_mask
 from mitsim.report import EQUAL_FRAME, EQUAL_PEAK, EQUAL_TOTAL, IDEALISED, RENDERED
-from mitsim.report.lit_scene import DIM, DIM_E, Plane, bin_frame
+from mitsim.report.lit_scene import DIM, DIM_E, Plane
 from mitsim.studies.camera_studies import modulation
 from mitsim.studies.framework.experiment import TEST_IMAGES, Setup
 from mitsim.studies.framework.studio import SIDE, Image, Studio, picture
@@ -163,7 +164,7 @@ def test_binned_frames_are_those_of_larger_pixels(studio: Studio, setup: Setup, 
 
 def test_frames_that_are_not_square_are_averaged_by_rows_and_columns(studio: Studio, setup: Setup) -> None:
     """And refused where squares do not fill them. (Planted: as many columns as rows; columns not looked at.)"""
-    found = bin_frame(np.arange(24.0).reshape(4, 6), 2)
+    found = reduce_frame(np.arange(24.0).reshape(4, 6), 2)
     assert found.tolist() == [[3.5, 5.5, 7.5], [15.5, 17.5, 19.5]]
     frames = studio.frames(setup, IDEALISED, "dots:4")
     wide = replace(frames, sides=(np.ones((48, 16)), np.ones((84, 16))))

@@ -171,7 +171,7 @@ def test_a_page_says_first_how_many_claims_hold(tmp_path: Path) -> None:
     assert tally(claims) == said and tally(claims[:1]) == "1 claim: 1 confirmed" and not tally(())
     results = invented("patterns")
     shown = {"psnr.png": curves({"": {"a": curve((1, 1.0), (2, 2.0))}}, "x [mm]")}
-    section = section_of(find("patterns"), "patterns", claims, shown, results)
+    section = section_of(find("patterns"), claims, shown, results)
     page = write_page([section], tmp_path / "page.html", section.title).read_text()
     order = [page.index(each) for each in (said, section.detail, "claim 4", "<img", "Zheng")]
     assert order == sorted(order)
