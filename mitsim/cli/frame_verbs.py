@@ -382,14 +382,12 @@ def import_(asked: Importing) -> int:
     elif output is None or calibration is not None:
         raise MitsimError(f"{source}: frames contain no calibration; give -o RUN, and leave out --calibration-output")
     else:
-        replaces = bool(asked.point and asked.overwrite)
         with asked.job() as job:
-            payload = mitsim.import_frames(source, output, job, overwrite=replaces, **facts)
+            payload = mitsim.import_frames(source, output, job, overwrite=asked.overwrite, **facts)
     if payload["holds"] == ["psf"]:
         import numpy as np
 
-        light = np.load(payload["output"])
-        light = light.mean(axis=2) if light.ndim == 3 else light
+        light = np.atleast_3d(np.load(payload["output"])).mean(axis=2)
         lines = [payload["headline"], f"Point spread function: {output}", *payload["notes"]]
         return asked.finish_frame((Path(payload["output"]), light, "electrons/s"), {**payload, "report": None}, lines)
     lines = [f"Run: {payload['output']}"] if payload["output"] else []

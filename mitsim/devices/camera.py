@@ -22,7 +22,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.core.files import FRAME_LIMITS, fits_a_frame
 from mitsim.core.images import image_pages, own_end, read_image, reduce_frame
 from mitsim.core.job import Cost, Limits
-from mitsim.core.picture_files import BGGR, PLANES, Wanted, planes_of
+from mitsim.core.picture_files import BGGR, PLANES, RGB, Wanted, planes_of
 from mitsim.core.seeds import stream
 from mitsim.devices.mask import FEW, LARGEST, NO_FLAWS, CameraMask, Flaws, Mask, MaskKind, Plate, mls_mask, within
 from mitsim.devices.patterns import is_prime
@@ -551,11 +551,10 @@ def load_psf_channels(
     """
     path = Path(path)
     values = np.moveaxis(_read(path, reduce), 2, 0)
-    if len(values) not in (1, len(names)):
-        lines = f"and the run has {len(names)} lines, {', '.join(names)}"
-        raise _PICTURE.refusal(
-            path, f"has {len(values)} channels, {lines}; give a channel for each line, or one for all"
-        )
+    of_lines = tuple(names) == RGB or path.suffix.lower() == ".npy"
+    if len(values) not in (1, len(names)) or (len(values) > 1 and not of_lines):
+        found = f"has {len(values)} channels, and the run {len(names)} lines, {', '.join(names)}"
+        raise _PICTURE.refusal(path, f"{found}; give one for all in grey, or NPY of (rows, columns, lines)")
     rows, columns = values.shape[1:]
     if len(values) == 1 and tuple(names) == PLANES and (rows > frame[0] or columns > frame[1]):
         if (rows, columns) != (2 * frame[0], 2 * frame[1]) or "orientation" in how or min(frame) <= 2 * PSF_BORDER:

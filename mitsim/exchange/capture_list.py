@@ -167,12 +167,8 @@ class RealCapture:
             return self
         if size[2] != len(picture_files.RGB):
             raise MitsimError(f"{path}: has {size[2]} numbers a pixel; save red, green and blue alone")
-        prepare = self.listed.prepare
-        for name, value in ("mosaic", prepare.mosaic), ("channel", prepare.channel):
-            if value is not None:
-                raise ArgumentError(
-                    name, f"{value}: {path} is no mosaic but in colour, all of which is read; leave it out"
-                )
+        if (channel := self.listed.prepare.channel) is not None:
+            raise ArgumentError("channel", f"{channel}: {path} is in colour and no mosaic; leave it out")
         known = replace(self, rgb=True)
         known.check(path)
         return known
@@ -250,8 +246,7 @@ _FIELDS = {
 _OWN = {"camera", "bits", "crop"}
 """Options whose fields of the same name have another meaning or form."""
 _OF_PATTERNS = (
-    *("patterns", "calibration", "projector_pixels", "ambient_frame", "ambient_shots"),
-    *("closing_frame", "closing_exposure", "order", "seed"),
+    "patterns calibration projector_pixels ambient_frame ambient_shots closing_frame closing_exposure order seed"
 )
 """Options without effect on frames of a point source."""
 LISTS, CAMERAS, PROJECTORS = (
@@ -348,11 +343,12 @@ class FrameFacts(Options):
         known["prepare"] = validate(Preparation, prepare, "import")
         calibration = None if self.calibration is None else Path(self.calibration)
         listed = validate(CaptureList, known, "import")
-        point = bool(self.point)
-        if point:
-            self.refuse(_OF_PATTERNS, "on frames of a point source")
-        capture = RealCapture(listed, given.get("camera"), self.exposure, calibration, self.black_level, point=point)
-        if not point and not takes_seed(capture.patterns):
+        if self.point:
+            self.refuse(_OF_PATTERNS.split(), "on frames of a point source")
+        capture = RealCapture(
+            listed, given.get("camera"), self.exposure, calibration, self.black_level, point=bool(self.point)
+        )
+        if not self.point and not takes_seed(capture.patterns):
             self.refuse(("seed",), "on patterns that are not drawn at random")
         capture.check(source)
         return capture

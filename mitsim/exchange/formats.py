@@ -273,8 +273,6 @@ def import_frames(
         from mitsim.exchange.point_source import stack_point
 
         return stack_point(Path(source), Path(output), facts, overwrite)
-    if overwrite:
-        raise ArgumentError("overwrite", "replaces files of a point source alone; remove the earlier run")
     from mitsim.exchange.packed import import_capture
 
     return import_capture(Path(source), Path(output), facts, None if job is None else job.command)

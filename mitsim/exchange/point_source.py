@@ -12,7 +12,7 @@ from scipy.ndimage import uniform_filter
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import ArgumentError, MitsimError
-from mitsim.core.files import check_apart, output_file, resolve
+from mitsim.core.files import output_file, resolve
 from mitsim.core.headline import headline
 from mitsim.core.images import Numbers, Preparer, image_header, read_images, write_numbers
 from mitsim.core.job import Cost, Limits
@@ -33,8 +33,6 @@ _LIT, _SIDE = 5.0, 5
 """Deviations of the background above which the mean of 5 x 5 pixels is light."""
 _EDGE = 0.05
 """Share of the mean light above which the edges are lit."""
-_WEAK = 20.0
-"""Brightest pixel over the deviation of the background, below which noise shows in images."""
 
 
 def stack_point(source: Path, output: Path, known: RealCapture, overwrite: bool = False) -> dict[str, Any]:
@@ -46,14 +44,13 @@ def stack_point(source: Path, output: Path, known: RealCapture, overwrite: bool 
     """
     if output.suffix.lower() != ".npy":
         raise ArgumentError("output", f"{output}: a point spread function is an array; give a file that ends in .npy")
-    if resolve(output).parent == resolve(source):
+    stated = (getattr(known.listed.prepare, name) for name in CORRECTIONS)
+    if {*map(resolve, (source, *filter(None, stated)))} & {resolve(output), resolve(output).parent}:
         raise ArgumentError("output", f"{output}: lies among the frames that are read; choose another folder")
     files = image_files(source, known.wanted)
     size = image_header(files[0], known.wanted)[1]
     known = known.of_file(files[0], size)
     Cost(memory_bytes=_NUMBER_BYTES * math.prod(size)).check(f"stack of {source}", Limits())
-    stated = (getattr(known.listed.prepare, name) for name in CORRECTIONS)
-    check_apart(output, [source, *(Path(each) for each in stated if each)])
     with output_file(output, overwrite) as place:
         camera, prepare = known.electronics()
         found = survey(files, known, camera, prepare)
@@ -65,14 +62,9 @@ def stack_point(source: Path, output: Path, known: RealCapture, overwrite: bool 
             warnings.append(f"Saturated: {saturated} readings are at the end of the range or clipped; expose for less")
         edges = np.ones(light.shape[1:], dtype=bool)
         edges[PSF_BORDER:-PSF_BORDER, PSF_BORDER:-PSF_BORDER] = False
-        if edges.all():
-            raise MitsimError(
-                f"{source}: frames of {light.shape[1]} x {light.shape[2]}; give more than {2 * PSF_BORDER}"
-            )
         background = np.median(light[:, edges], axis=1)
         noise = 1.4826 * np.median(np.abs(light[:, edges] - background[:, None]), axis=1)
         light -= background[:, None, None]
-        peak = light.max(axis=(1, 2))
         left = float((background / np.maximum(light.mean(axis=(1, 2)), _NOTHING)).max())
         if prepare.dark and left > _EDGE:
             warnings.append(
@@ -80,13 +72,9 @@ def stack_point(source: Path, output: Path, known: RealCapture, overwrite: bool 
                 "of the point that falls beside the sensor; take dark frames with the point alone covered"
             )
         lit = (uniform_filter(light, (0, _SIDE, _SIDE)) > _LIT / _SIDE * noise[:, None, None]).any(axis=0)
-        ratio = float((peak / np.maximum(noise, _NOTHING)).min())
+        ratio = float((light.max(axis=(1, 2)) / np.maximum(noise, _NOTHING)).min())
         if not lit.any() or ratio < _LIT:
             raise MitsimError(f"{source}: nothing is brighter than the frames' edges; expose for longer")
-        if ratio < _WEAK:
-            warnings.append(
-                f"Weak: the brightest pixel is {ratio:.2g} times the noise; take more frames, or a longer exposure"
-            )
         if prepare.crop is None:
             light = _cut(light, lit)
         write_numbers(place, np.moveaxis(light, 0, -1).astype(np.float32).squeeze())

@@ -397,9 +397,9 @@ def _of_colours(lines: SpectralFolder) -> Shown:
         pictures.append(Picture.of("error", title, image.delta_e, about, unit, ends, quantity="error"))
     for number, line in enumerate(colours.channels):
         title, own, quality_of_line = f"{line.wavelength_nm:g} nm", images[..., number], image.qualities[line.name]
-        scale: dict[str, Any] = {"unit": "electrons/s", "ends": (0.0, None)} if by_spread else {}
+        unit, most = ("electrons/s", None) if by_spread else (REFLECTANCE, 1.0)
         about = str(quality_of_line or "")
-        pictures.append(Picture.of(f"image_{line.name}", f"{title}, image", own, about, **scale))
+        pictures.append(Picture.of(f"image_{line.name}", f"{title}, image", own, about, unit, (0.0, most)))
         if truth is not None:
             pictures.append(Picture.of(f"truth_{line.name}", f"{title}, truth", truth[..., number]))
             pictures.append(_difference(f"error_{line.name}", f"{title}, difference", own, truth[..., number]))

@@ -6,7 +6,7 @@ A run has one unnamed line, a folder for each line, or frames of all lines behin
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -160,29 +160,27 @@ def reconstruct_colours(
     run, calibration, output, job = Path(run), Path(calibration), Path(output), job or Job()
     found = colour_files.open_lines(run, colour_files.RUN, colour_files.MOSAIC)
     lines = found.filters or colour_files.read_colours(run, colour_files.RUN)
-    if calibration.is_file():
-        if found.filters or chart:
+    by_point, board = calibration.is_file(), None
+    if by_point and (found.filters or chart):
+        raise MitsimError(f"{calibration}: is no folder; runs behind colour filters, and charts, need a calibration")
+    if not by_point:
+        colour_files.check_lines(lines, str(run), calibration)
+        parts = [calibration / name for name in lines.names]
+        boards = {read_manifest(part, CalibrationManifest).board_reflectance for part in parts}
+        if len(boards) > 1:
             raise MitsimError(
-                f"{calibration}: is no calibration folder, which runs behind colour filters and charts need"
+                f"calibration {calibration}: its lines' boards reflect {boards}; calibrate all with one board"
             )
-        image = _solve_by_point(lines, run, calibration, output, reduce, overwrite, job, ImageRequest(**options))
-        if page:
-            report_folder(output)
-        return image
-    colour_files.check_lines(lines, str(run), calibration)
-    boards = {read_manifest(calibration / name, CalibrationManifest).board_reflectance for name in lines.names}
-    if len(boards) > 1:
-        raise MitsimError(
-            f"calibration {calibration}: its lines' boards reflect {boards}; calibrate all with one board"
-        )
-    board = boards.pop()
+        board = boards.pop()
 
     def finish(folder: Path, **solved: Any) -> ColourImage:
         image = ColourImage(lines=lines, board=board or 1.0, chart=chart, output=str(folder), **solved)
-        image.write(folder, **_origin(job, run, calibration))
+        image.write(folder, **_origin(job, run, None if by_point else calibration))
         return image
 
-    if found.filters:
+    if by_point:
+        image = _solve_by_point(lines, run, calibration, output, reduce, overwrite, job, finish, **options)
+    elif found.filters:
         for name in options.keys() - {"lam"}:
             raise ArgumentError(name, "has no effect behind colour filters; leave it out")
         image = _solve_at_once(lines, run, calibration, output, board, overwrite, job, finish, **options)
@@ -203,16 +201,11 @@ def reconstruct_colours(
                     (folder / colour_files.COLOUR).unlink()
                 raise
             solved = {name: judged.reconstruction for name, judged in images.items()}
-            shapes = {each.image.shape for each in solved.values()}
-            if len(shapes) > 1:
-                raise MitsimError(
-                    f"colour: the lines' images have {sorted(shapes)} pixels; capture all lines in one grid"
-                )
             truths = [judged.truth for judged in images.values() if judged.truth is not None]
             of_lines = {name: judged.summary() for name, judged in images.items()}
             image = finish(
                 folder,
-                images=np.stack([each.image for each in solved.values()], axis=-1),
+                images=_stack(solved),
                 truth=np.stack(truths, axis=-1) if len(truths) == len(images) else None,
                 qualities={name: judged.quality for name, judged in images.items()},
                 facts={
@@ -230,6 +223,13 @@ def reconstruct_colours(
     return image
 
 
+def _stack(solved: Mapping[str, Reconstruction]) -> FloatArray:
+    shapes = {each.image.shape for each in solved.values()}
+    if len(shapes) > 1:
+        raise MitsimError(f"colour: the lines' images have {sorted(shapes)} pixels; capture all lines in one grid")
+    return np.stack([each.image for each in solved.values()], axis=-1)
+
+
 @single_threaded_blas()
 def _solve_by_point(
     lines: colour_files.ColourManifest,
@@ -239,11 +239,13 @@ def _solve_by_point(
     reduce: int,
     overwrite: bool,
     job: Job,
-    request: ImageRequest,
+    finish: Callable[..., ColourImage],
+    **options: Any,
 ) -> ColourImage:
     """Solve each line with its own channel of the light, and one lambda: channels of other sharpness have fringes."""
     from mitsim.reconstruct.point_spread import SeenFrames, automatic_weight, psf_inputs
 
+    started, request = time.perf_counter(), ImageRequest(**options)
     request.check_point_spread(reduce)
     shots = {name: load_run(run / name) for name in lines.names}
     first = shots[lines.names[0]]
@@ -273,26 +275,22 @@ def _solve_by_point(
             with output_folder(folder / name, overwrite=True) as place:
                 of_lines[name] = Judged(solved[name], None, str(place)).summary()
                 solved[name].write(place, {**of_lines[name], **_origin(job, run / name)})
-        images = np.stack([each.image for each in solved.values()], axis=-1)
+        images = _stack(solved)
         # A white object has the colours of the point.
         balance = np.broadcast_to(totals / totals.mean(), len(solved))
         white = max(float((images / balance).max()), _LEAST)
-        image = ColourImage(
-            lines=lines,
+        return finish(
+            folder,
             images=images,
-            board=1.0,
             qualities=dict.fromkeys(lines.names),
             facts={"solved": "each line by its light of a point, all with one lambda", "lambda": f"{lam:.3g}"},
             warnings=each_once({name: each.status.reasons for name, each in solved.items()}),
-            seconds={"total": sum(each["seconds"]["total"] for each in of_lines.values())},
-            output=str(folder),
+            seconds={"total": time.perf_counter() - started},
             solution={"lambda": lam, "white": white, "balance": balance},
             of_lines=of_lines,
             inputs=inputs,
             by_point=ColourModel.of_channels(lines.names, lines.wavelengths_nm, white * balance),
         )
-        image.write(folder, **_origin(job, run))
-    return image
 
 
 @single_threaded_blas()

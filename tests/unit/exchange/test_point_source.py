@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mitsim.core.errors import MitsimError
 from mitsim.devices.camera import load_psf
 from mitsim.exchange.formats import import_frames
 from tests.unit.reconstruct.test_point_spread import CAMERA, called, mosaic, save
@@ -88,7 +87,6 @@ def test_frames_that_spoil_the_stack_are_flagged(tmp_path: Path) -> None:
         assert found["saturated"] > 0 and any("Saturated" in each for each in found["warnings"])
     dark, lit = frames(tmp_path / "dark", 0 * light), frames(tmp_path / "lit", light + 100)
     assert "Lit edges" in str(stacked(tmp_path, lit, dark_frame=dark)["warnings"])
-    assert "Weak" in str(stacked(tmp_path, frames(tmp_path / "weak", light / 10, 1))["warnings"])
 
 
 def test_what_is_no_point_is_refused_in_a_line(tmp_path: Path) -> None:
@@ -103,7 +101,7 @@ def test_what_is_no_point_is_refused_in_a_line(tmp_path: Path) -> None:
         (source, ("-o", source / "psf.npy"), "lies among the frames"),
         (source, ("--patterns", "uniform", "-o", tmp_path / "a.npy"), "has no effect on frames of a point source"),
         (frames(tmp_path / "none", 0 * light, 1), ("-o", tmp_path / "a.npy"), "nothing is brighter"),
-        (save(tmp_path / "small.npy", np.ones((20, 20))), ("-o", tmp_path / "a.npy"), "give more than 32"),
+        (save(tmp_path / "small.npy", np.ones((20, 20))), ("-o", tmp_path / "a.npy"), "nothing is brighter"),
         (save(tmp_path / "nan.npy", np.full(SIZE, np.nan)), ("-o", tmp_path / "a.npy"), "not finite"),
         (save(tmp_path / "four.npy", np.ones((*SIZE, 4))), ("-o", tmp_path / "a.npy"), "has 4 numbers a pixel"),
         (tmp_path / "bad", ("-o", tmp_path / "a.npy"), "cannot be read"),
@@ -115,6 +113,3 @@ def test_what_is_no_point_is_refused_in_a_line(tmp_path: Path) -> None:
     assert status == 0 and found["output"] == str(tmp_path / "a.npy")
     assert called("import", source, *asked, "-o", tmp_path / "a.npy")[0] == 2, "it is there"
     assert called("import", source, *asked, "-o", tmp_path / "a.npy", "--overwrite")[0] == 0
-    with pytest.raises(MitsimError, match="replaces files of a point source alone"):
-        import_frames(source, tmp_path / "run", overwrite=True, patterns="uniform", camera=tmp_path / "camera.toml",
-                      exposure=1.0, projector_pixels=4)  # fmt: skip

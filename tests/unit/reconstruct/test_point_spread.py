@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 from scipy.ndimage import gaussian_filter
 from scipy.optimize import lsq_linear, nnls
 from typer.testing import CliRunner
@@ -22,6 +23,7 @@ from mitsim.core.exr import read_frame
 from mitsim.core.images import lightness, read_image, reduce_frame
 from mitsim.core.manifests import Digital, Patterns, RunHead, RunManifest
 from mitsim.core.runs import Capture, Recorder, frame_name
+from mitsim.devices.camera import load_psf_channels
 from mitsim.devices.patterns import parse_patterns
 from mitsim.exchange.formats import import_frames
 from mitsim.reconstruct import point_spread as ps
@@ -543,7 +545,7 @@ def test_an_image_in_colour_has_the_scene_s_colours_in_the_point_s_light(tmp_pat
     status, found = called(*asked, tmp_path / "mosaic", "--psf", save(tmp_path / "raw.npy", raw))
     assert status == 0 and error("mosaic") < 0.25, found
     for psf, words in (
-        (save(tmp_path / "four.npy", np.dstack([light, light[..., 1]])), "has 4 channels, and the run has 3 lines"),
+        (save(tmp_path / "four.npy", np.dstack([light, light[..., 1]])), "has 4 channels, and the run 3 lines"),
         (save(tmp_path / "dark.npy", light * [1, 1, 0]), "nothing is brighter than its edges"),
         (save(tmp_path / "nan.npy", np.where(light == light.max(), np.nan, light)), "1 values are not finite"),
         (save(tmp_path / "tiny.npy", light[:9]), "needs more than 32 pixels"),
@@ -553,8 +555,15 @@ def test_an_image_in_colour_has_the_scene_s_colours_in_the_point_s_light(tmp_pat
         assert status == 2 and words in text and not (tmp_path / "no").exists(), text
     status, text = called(*asked, tmp_path / "no", "--psf", save(tmp_path / "odd.npy", raw[1:]))
     assert status == 2 and "a raw mosaic of the run's 60 x 62 pixels a plane has twice as many" in text
+    status, text = called(*asked, tmp_path / "no", "--psf", save_png(tmp_path / "rgb.png", light))
+    assert status == 2 and "has 3 channels, and the run 4 lines" in text
+    with pytest.raises(MitsimError, match="has 3 channels, and the run 3 lines, 450nm"):
+        load_psf_channels(tmp_path / "rgb.png", ("450nm", "520nm", "638nm"), (60, 62), {})
+    odd = import_frames(save(tmp_path / "odd.npy", mosaic(seen)[1:]), tmp_path / "odd", channel="all", **facts)
+    status, text = called("reconstruct", tmp_path / "odd", "--psf", tmp_path / "grey.npy", "-o", tmp_path / "uneven")
+    assert odd["planes"] and status == 2 and "capture all lines in one grid" in text
     for more in ({"channel": "all"}, {"channel": "r", "mosaic": "RGGB"}):
-        with pytest.raises(ArgumentError, match="is no mosaic but in colour"):
+        with pytest.raises(ArgumentError, match="is in colour and no mosaic"):
             import_frames(tmp_path / "seen.npy", tmp_path / "no", **facts, **more)
     np.save(tmp_path / "seen.npy", np.dstack([seen, seen[..., 0]]))
     with pytest.raises(MitsimError, match="has 4 numbers a pixel"):
@@ -566,6 +575,11 @@ def mosaic(colours: np.ndarray) -> np.ndarray:
     raw = np.kron(colours[..., 1], np.array([[0, 1], [1, 0]], colours.dtype))
     raw[::2, ::2], raw[1::2, 1::2] = colours[..., 0], colours[..., 2]
     return raw
+
+
+def save_png(path: Path, values: np.ndarray) -> Path:
+    Image.fromarray((values / values.max() * 255).astype(np.uint8)).save(path)
+    return path
 
 
 def save(path: Path, values: np.ndarray) -> Path:
