@@ -579,7 +579,6 @@ def _read(path: Path, reduce: int, most: int | None = None) -> FloatArray:
 
 
 def _light(path: Path, values: FloatArray, reduce: int) -> FloatArray:
-    rows, columns = (side // reduce for side in values.shape)
     inside = np.zeros(values.shape, dtype=bool)
     inside[PSF_BORDER:-PSF_BORDER, PSF_BORDER:-PSF_BORDER] = True
     above = values - np.median(values[~inside])
