@@ -15,6 +15,7 @@ import numpy as np
 
 from mitsim.core.errors import MitsimError
 from mitsim.scene.check import PLUGINS, STRAIGHT
+from tests import measured_tables
 from tests.conftest import write_png, write_small_scene
 
 PLATE = '<shape type="rectangle"><transform name="to_world"><rotate y="1" angle="180"/><scale x="20" y="20"/>'
@@ -27,6 +28,7 @@ _NESTED = {
     "blendbsdf": f'<float name="weight" value="0.3"/>{GREY}<bsdf type="roughconductor"/>',
     "bumpmap": f'<texture name="arbitrary" type="bitmap"><string name="filename" value="grey.png"/></texture>{GREY}',
     "mask": f'<float name="opacity" value="0.5"/>{GREY}',
+    "measured": '<string name="filename" value="table.bsdf"/>',
     "mitsim_glass": '<string name="glass" value="n-bk7"/>',
     "mitsim_grating": FLOAT.format("pitch", 1600),
     "normalmap": '<texture name="normalmap" type="bitmap"><string name="filename" value="normals.png"/>'
@@ -77,6 +79,7 @@ def scene(folder: Path, tag: str, plugin: str) -> Path:
     write_png(folder / "grey.png", np.linspace(40, 200, 64).reshape(8, 8))
     write_png(folder / "colours.png", np.random.default_rng(1).integers(0, 256, (8, 8, 3)))
     write_png(folder / "normals.png", np.broadcast_to([128, 128, 255], (4, 4, 3)))
+    measured_tables.save(folder / "table.bsdf", measured_tables.known(0.3))
     (folder / "mesh.ply").write_text(_MESH)
     (folder / "mesh.obj").write_text(_OBJ)
     path = write_small_scene(folder, f"{tag}_{plugin}", 4, pixels=16, mask="open", extra=_extra(tag, plugin))

@@ -18,7 +18,7 @@ import pydantic
 from mitsim.core.configuration import limits_of
 from mitsim.core.errors import MitsimError, cut, near_name
 from mitsim.devices.camera import PIXELS, CameraGeometry
-from mitsim.scene.headers import FARTHEST, MOST_TEXELS, check_image, check_obj, check_ply
+from mitsim.scene.headers import FARTHEST, MOST_TEXELS, check_image, check_obj, check_ply, read_measured
 from mitsim.scene.outline import DEEPEST, MOST_ELEMENTS, Outline, Tag
 
 _LARGEST = 1e20
@@ -100,9 +100,9 @@ _TEXTURES = "bitmap blackbody checkerboard d65 irregular mesh_attribute rawconst
 PLUGINS = {
     tag: names.split()
     for tag, names in {
-        "bsdf": "blendbsdf bumpmap circular conductor dielectric diffuse hair mask mitsim_glass mitsim_grating "
-        "normalmap null plastic polarizer pplastic principled principledthin retarder roughconductor roughdielectric "
-        "roughplastic thindielectric twosided",
+        "bsdf": "blendbsdf bumpmap circular conductor dielectric diffuse hair mask measured mitsim_glass "
+        "mitsim_grating normalmap null plastic polarizer pplastic principled principledthin retarder "
+        "roughconductor roughdielectric roughplastic thindielectric twosided",
         "emitter": "area constant directional envmap mitsim_projector point projector spot",
         "film": "hdrfilm specfilm",
         "integrator": "direct path ptracer volpath volpathmis",
@@ -155,13 +155,13 @@ STRAIGHT = ("circular", "mask", "null", "polarizer", "retarder", "thindielectric
 """Materials that let light pass straight on."""
 BUMPS = ("bumpmap", "normalmap")
 """Materials that change the frame of another one and hide which light it lets pass."""
-DIRECTED = (*BUMPS, "hair", "principledthin")
+DIRECTED = (*BUMPS, "hair", "measured", "principledthin")
 """Materials that are not reciprocal."""
 CHOICES = ("blendbsdf", "mask", "twosided")
 """Materials that choose between two others."""
 MIRRORS = ("conductor", "dielectric", "mitsim_glass", "plastic", "thindielectric")
 """Materials that reflect or refract into single directions."""
-_TURNING, _ALONG = (*BUMPS, "hair", "mitsim_grating"), ("alpha_u", "alpha_v", "anisotropic")
+_TURNING, _ALONG = (*BUMPS, "hair", "measured", "mitsim_grating"), ("alpha_u", "alpha_v", "anisotropic")
 """Materials that vary along the surface, and parameters that cause this."""
 SMALL_LAMPS = ("directional", "point", "spot")
 """Lamps that no path can hit."""
@@ -276,7 +276,7 @@ def find_unfit(outline: Outline, nodes: Sequence[mi.parser.SceneNode]) -> Unfit:
 # -------- Checks of a scene file
 
 _IMAGES = ("bitmap", "envmap")
-_READERS = (*_IMAGES, "ply", "obj")
+_READERS = (*_IMAGES, "measured", "ply", "obj")
 _LARGEST_MATERIAL = 256
 """Largest number of objects of one BSDF, because all are compiled into every kernel."""
 _COLOURED = ("blackbody", "d65", "irregular", "mesh_attribute", "mitsim_glass", "mitsim_grating", "regular")
@@ -448,7 +448,7 @@ def _check_property(checked: CheckedScene, node: mi.parser.SceneNode, name: str)
     elif kind == _Type.String and name not in ("values", "wavelengths"):
         text = node.props[name]
         if name == "filename" and plugin not in _READERS:
-            raise tag.refusal(name, repr(text), "only bitmap, envmap, ply and obj read a file")
+            raise tag.refusal(name, repr(text), "only bitmap, envmap, measured, ply and obj read a file")
         if name == "material" and not re.fullmatch(r"[A-Za-z0-9_-]+", text):
             raise tag.refusal(name, repr(text), "give the name of a material, as Au")
         if name not in ("filename", "material") and ("/" in text or ".." in text):
@@ -494,6 +494,9 @@ def _check_resource(checked: CheckedScene, node: mi.parser.SceneNode) -> None:
             checked.texels += texels
             if not grey:
                 checked.coloured.append(tag)
+        elif plugin == "measured":
+            read_measured(path)
+            checked.coloured.append(tag)
         else:
             given, checked.unread[str(path)] = (check_ply if plugin == "ply" else check_obj)(path)
             checked.normals.setdefault(Path(name).name, set()).add(given)

@@ -1,11 +1,13 @@
-"""Checks of images and meshes before Mitsuba allocates memory for them.
+"""Checks of images, meshes and measured materials before Mitsuba allocates memory for them.
 
 Each function raises ValueError with a sentence that completes "the file ...", or OSError.
 """
 
 from __future__ import annotations
 
+import math
 import re
+import struct
 from array import array
 from itertools import pairwise
 from pathlib import Path
@@ -41,6 +43,14 @@ _TURNED, _BENT = 1e-3, 1e-2
 """Parts of a face's area by which rounding may turn a triangle over, and triangles may exceed it (16 degrees).
 """
 _MOST_TEXT = 64 << 20
+_MEASURED = {
+    "phi_i": "p", "theta_i": "t", "ndf": "ab", "sigma": "cd", "vndf": "ptef", "luminance": "ptss", "jacobian": "1",
+    "wavelengths": "w", "spectra": "ptwss", "rgb": "pt3ss",
+}  # fmt: skip
+"""Fields of a measured material, with a letter or number for the length of each axis."""
+_GAP, _TURN_BEGINS, _MOST_FIELDS = 0.2, -170, 100
+_NEGATIVE = 0.01
+"""Part of its largest value by which a measured value may be negative."""
 
 
 def check_image(path: Path) -> tuple[int, bool]:
@@ -198,6 +208,63 @@ def _ply_header(header: bytes) -> tuple[str | None, dict[str, tuple[int, _Proper
     if not parts["face"][0]:
         raise ValueError("has no triangles: it is a cloud of points; export a mesh")
     return order, parts
+
+
+def read_measured(path: Path) -> dict[str, npt.NDArray[Any]]:
+    """Return the fields of a measured material by name; it has ``spectra`` and ``wavelengths``, or ``rgb``.
+
+    Small negative values, which noise and narrow colours cause, become 0.
+    """
+    content = path.read_bytes()
+    try:
+        fields = _tensors(content)
+    except (struct.error, UnicodeDecodeError):
+        fields = {}
+    wanted = {*_MEASURED} - ({"rgb"} if "wavelengths" in fields else {"spectra", "wavelengths"})
+    if not wanted <= fields.keys():
+        raise ValueError("is no measured material in the tensor format, or a damaged one; fetch it again")
+    table, lengths = dict[str, npt.NDArray[Any]](), {"1": 1, "3": 3}
+    for name in sorted(wanted, key=[*_MEASURED].index):
+        kind, start, shape = fields[name]
+        axes, item = _MEASURED[name], np.dtype("u1" if name == "jacobian" else "<f4")
+        fits = kind == (1 if name == "jacobian" else 10) and len(shape) == len(axes)
+        if not fits or any(lengths.setdefault(axis, size) != size for axis, size in zip(axes, shape, strict=True)):
+            raise ValueError(f"has a field {name} of another type or shape than its format has; fetch it again")
+        if start + math.prod(shape) * item.itemsize > len(content):
+            raise ValueError(f"claims more values of {name} than it holds; fetch it again")
+        values = np.frombuffer(content, item, math.prod(shape), start).reshape(shape).astype(item)
+        low, high = float(values.min(initial=0)), float(values.max(initial=0))
+        if not np.isfinite(values).all() or (name != "phi_i" and low < -_NEGATIVE * high):
+            raise ValueError(f"has {name} that are negative or not finite; fetch it again")
+        table[name] = values if name == "phi_i" else np.maximum(values, 0)
+    if min(lengths[axis] for axis in "abcdefst") < 2 or not lengths["p"] or lengths.get("w", 2) < 2:
+        raise ValueError("has an axis of a single value; a table is interpolated between two or more")
+    for name, end in (("phi_i", np.pi), ("theta_i", np.pi / 2), ("wavelengths", np.inf)):
+        if name in table and (np.any(np.diff(table[name]) <= 0) or np.abs(table[name]).max() > end + 1e-5):
+            raise ValueError(f"has {name} that do not grow, or lie outside their range; fetch it again")
+    first, last = np.degrees(table["phi_i"][[0, -1]])
+    parts = 360 / (last - first) if lengths["p"] > 2 else 1
+    if min(abs(parts - whole) for whole in (1, 2, 4)) > _GAP or (lengths["p"] > 2 and first > _TURN_BEGINS):
+        rule = "a whole turn, a half or a quarter is read, from -180 degrees on"
+        raise ValueError(f"has phi_i of {first:.4g} to {last:.4g} degrees; {rule}")
+    if min(table[name].sum(axis=(2, 3)).min() for name in ("vndf", "luminance")) <= 0 or (
+        table["jacobian"][0] and not table["sigma"].all()
+    ):
+        raise ValueError("has a direction without light in vndf, luminance or sigma; fetch it again")
+    return table
+
+
+def _tensors(content: bytes) -> dict[str, tuple[int, int, tuple[int, ...]]]:
+    """Return type, offset and shape of each field of a file in Mitsuba's tensor format."""
+    fields, at = dict[str, tuple[int, int, tuple[int, ...]]](), 18
+    head, version, count = struct.unpack_from("<12sHI", content)
+    for _ in range(count if head == b"tensor_file\0" and version == 1 and count < _MOST_FIELDS else 0):
+        (length,) = struct.unpack_from("<H", content, at)
+        name, at = content[at + 2 : at + 2 + length].decode(), at + 2 + length
+        dimensions, kind, offset = struct.unpack_from("<HBQ", content, at)
+        fields[name] = kind, offset, struct.unpack_from(f"<{dimensions}Q", content, at + 11)
+        at += 11 + 8 * dimensions
+    return fields
 
 
 def check_obj(path: Path) -> tuple[bool, str]:

@@ -17,6 +17,10 @@ from mitsim.core.arrays import FloatArray
 Surface: TypeAlias = "mi.SurfaceInteraction3f"
 Light: TypeAlias = "mi.UnpolarizedSpectrum"
 Numbers: TypeAlias = "mi.Float | FloatArray"
+Draw: TypeAlias = "tuple[mi.BSDFSample3f, mi.Spectrum]"
+Value: TypeAlias = "tuple[mi.Spectrum, mi.Float]"
+LIGHT = "calibration", "mp_cl1.toml"
+"""The usual projector."""
 
 # -------- Between Dr.Jit and NumPy
 
@@ -132,3 +136,37 @@ def panchromatic(radiance: Light) -> mi.Float:
 
 def split_by_line(light: Light, lines: int) -> list[mi.Float]:
     return [panchromatic(light)] if lines == 1 else [light[line] / len(light) for line in range(lines)]
+
+
+# -------- Materials
+
+
+def bsdf_class() -> type:
+    """Return the base of our BSDFs; one without ``eval_pdf`` of its own is a delta, which no given direction meets."""
+
+    class ModelBSDF(mi.BSDF):  # type: ignore[misc]
+        name: str
+        model: object
+
+        def eval_pdf(self, *turn: Any) -> Value:
+            return mi.Spectrum(0), mi.Float(0)
+
+        def eval(self, *turn: Any) -> mi.Spectrum:
+            return self.eval_pdf(*turn)[0]
+
+        def pdf(self, *turn: Any) -> mi.Float:
+            return self.eval_pdf(*turn)[1]
+
+        def to_string(self) -> str:
+            return f"{self.name}[{self.model}]"
+
+    return ModelBSDF
+
+
+def adjoint(bsdf: mi.BSDF, ctx: mi.BSDFContext, si: Surface, wo: mi.Vector3f, active: mi.Bool) -> mi.Spectrum:
+    """Return the value for light from ``si.wi`` seen from ``wo``, with the cosine of ``wo``."""
+    seen = mi.SurfaceInteraction3f(si)
+    seen.wi = wo
+    context = mi.BSDFContext(mi.TransportMode.Radiance, ctx.type_mask, ctx.component)
+    value = bsdf.eval(context, seen, si.wi, active & (si.wi.z != 0))
+    return dr.select(si.wi.z != 0, value * dr.abs(wo.z / si.wi.z), 0)

@@ -100,7 +100,7 @@ from collections.abc import Iterator, Sequence
 from functools import reduce
 from operator import or_
 from types import MappingProxyType
-from typing import Annotated, Any, Literal, TypeAlias
+from typing import Annotated, Any, Literal
 
 import drjit as dr
 import mitsuba as mi
@@ -110,16 +110,14 @@ from pydantic import BaseModel, ConfigDict, Field
 from mitsim.core.configuration import read_toml, shipped_path, validate
 from mitsim.core.errors import MitsimError
 from mitsim.scene.check import BUMPS, CHOICES, DIRECTED
-from mitsim.transport.plugins.base import Light, Surface
+from mitsim.transport.plugins.base import LIGHT, Draw, Light, Surface, Value, adjoint, bsdf_class
+from mitsim.transport.plugins.measured import measured_class
 
-Draw: TypeAlias = "tuple[mi.BSDFSample3f, mi.Spectrum]"
-Value: TypeAlias = "tuple[mi.Spectrum, mi.Float]"
 GLASS, GRATING = "mitsim_glass", "mitsim_grating"
-_LIGHT = "calibration", "mp_cl1.toml"
 
 
 def plugin_classes() -> dict[str, type]:
-    return {GLASS: _glass(), GRATING: _grating(), **_wrappers()}
+    return {GLASS: _glass(), GRATING: _grating(), **_wrappers(), f"{PREFIX}measured": measured_class()}
 
 
 class _Model(BaseModel):
@@ -128,28 +126,6 @@ class _Model(BaseModel):
 
 def _numbers(text: str) -> list[float]:
     return [float(word) for word in re.split(r"[\s,]+", text.strip()) if word]
-
-
-def _bsdf_class() -> type:
-    """Return the base of our BSDFs; one without ``eval_pdf`` of its own is a delta, which no given direction meets."""
-
-    class ModelBSDF(mi.BSDF):  # type: ignore[misc]
-        name: str
-        model: object
-
-        def eval_pdf(self, *turn: Any) -> Value:
-            return mi.Spectrum(0), mi.Float(0)
-
-        def eval(self, *turn: Any) -> mi.Spectrum:
-            return self.eval_pdf(*turn)[0]
-
-        def pdf(self, *turn: Any) -> mi.Float:
-            return self.eval_pdf(*turn)[1]
-
-        def to_string(self) -> str:
-            return f"{self.name}[{self.model}]"
-
-    return ModelBSDF
 
 
 # -------- Glass
@@ -232,23 +208,24 @@ def is_glass(material: mi.BSDF) -> bool:
 
 
 def tune(scene: mi.Scene, wavelength_nm: float) -> None:
-    """Set the wavelength of a scene's glass in mono and RGB variants, unless its file names one."""
+    """Set the wavelength of glass and tables in mono and RGB variants, unless the scene file names one."""
     parameters = mi.traverse(scene)
     for name, (_, _, node, _) in parameters.properties.items():
-        if is_glass(node) and node.model.wavelength is None:
+        if getattr(node, "tuned", False):
             parameters[name] = wavelength_nm
     parameters.update()
 
 
 def _glass() -> type:
-    class DispersiveGlass(_bsdf_class()):  # type: ignore[misc]
+    class DispersiveGlass(bsdf_class()):  # type: ignore[misc]
         name = GLASS
 
         def __init__(self, props: mi.Properties) -> None:
             super().__init__(props)
             self.model = GlassModel.build(**{name: props[name] for name in GlassModel.model_fields if name in props})
-            usual = read_toml(shipped_path(*_LIGHT))["effective_wavelength_nm"]
+            usual = read_toml(shipped_path(*LIGHT))["effective_wavelength_nm"]
             self.wavelength = dr.opaque(mi.Float, self.model.wavelength or usual)
+            self.tuned = self.model.wavelength is None
             both = mi.BSDFFlags.FrontSide | mi.BSDFFlags.BackSide
             refracted = mi.BSDFFlags.DeltaTransmission | mi.BSDFFlags.NonSymmetric
             self.m_components = [mi.BSDFFlags.DeltaReflection | both, refracted | both]
@@ -313,7 +290,7 @@ class GratingModel(_Model):
     def of(cls, props: mi.Properties) -> GratingModel:
         values: dict[str, Any] = {}
         if "wavelengths" not in props:
-            light = read_toml(shipped_path(*_LIGHT))
+            light = read_toml(shipped_path(*LIGHT))
             values = {"wavelengths": light["wavelengths_nm"], "shares": light["radiant_shares"]}
         for name in cls.model_fields:
             if name not in props:
@@ -354,7 +331,7 @@ class GratingModel(_Model):
 
 
 def _grating() -> type:
-    class Grating(_bsdf_class()):  # type: ignore[misc]
+    class Grating(bsdf_class()):  # type: ignore[misc]
         name = GRATING
 
         def __init__(self, props: mi.Properties) -> None:
@@ -479,7 +456,7 @@ _ANY = 2**32 - 1
 
 
 def _wrappers() -> dict[str, type]:
-    class Wrapper(_bsdf_class()):  # type: ignore[misc]
+    class Wrapper(bsdf_class()):  # type: ignore[misc]
         parts: list[mi.BSDF]
 
         def _hold(self, props: mi.Properties, *parts: mi.BSDF) -> None:
@@ -577,26 +554,17 @@ def _wrappers() -> dict[str, type]:
             if self.white is not None:
                 # Refracted light is looked at from the side that it comes from, where white matt has a value.
                 beside = bs.wo * dr.mulsign(dr.mulsign(mi.Float(1), si.wi.z), bs.wo.z)
-                values = _adjoint(self.white, ctx, si, beside, single), self.white.eval(ctx, si, beside, single)
+                values = adjoint(self.white, ctx, si, beside, single), self.white.eval(ctx, si, beside, single)
                 into, out = (mi.unpolarized_spectrum(each)[0] for each in values)
                 value *= dr.select(single, dr.select(out > 0, into / out, 0), 1)
-            turned = _adjoint(self.parts[0], ctx, si, bs.wo, active & ~single)
+            turned = adjoint(self.parts[0], ctx, si, bs.wo, active & ~single)
             return bs, dr.select(single, value, dr.select(bs.pdf > 0, turned / bs.pdf, 0))
 
         def eval_pdf(self, ctx: mi.BSDFContext, si: Surface, wo: mi.Vector3f, active: mi.Bool = True) -> Value:
             value, density = self.parts[0].eval_pdf(ctx, si, wo, active)
             if ctx.mode == mi.TransportMode.Importance:
-                value = _adjoint(self.parts[0], ctx, si, wo, active)
+                value = adjoint(self.parts[0], ctx, si, wo, active)
             return value, density
 
     made = {**dict.fromkeys(CHOICES, Choice), **dict.fromkeys(DIRECTED, Directed)}
     return {PREFIX + name: each for name, each in made.items()}
-
-
-def _adjoint(bsdf: mi.BSDF, ctx: mi.BSDFContext, si: Surface, wo: mi.Vector3f, active: mi.Bool) -> mi.Spectrum:
-    """Return the value for light from ``si.wi`` seen from ``wo``, with the cosine of ``wo``."""
-    seen = mi.SurfaceInteraction3f(si)
-    seen.wi = wo
-    context = mi.BSDFContext(mi.TransportMode.Radiance, ctx.type_mask, ctx.component)
-    value = bsdf.eval(context, seen, si.wi, active & (si.wi.z != 0))
-    return dr.select(si.wi.z != 0, value * dr.abs(wo.z / si.wi.z), 0)

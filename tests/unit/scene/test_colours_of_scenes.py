@@ -28,6 +28,8 @@ def refused(tag: str, plugin: str, variant: str) -> Mapping[str, str]:
         return dict.fromkeys(ALL, f"{variant} lacks it")
     if plugin == "hair" and variant == "llvm_ad_mono":
         return dict.fromkeys(ALL, "give sigma_a")
+    if plugin == "measured" and variant == "llvm_ad_rgb":
+        return dict.fromkeys(ALL, "table.bsdf has spectra, which llvm_ad_rgb cannot use")
     if tag == "rfilter" and plugin != "box":
         return dict.fromkeys(ALL, "use <rfilter type='box'/>")
     if tag in ("medium", "phase", "volume"):

@@ -16,6 +16,7 @@ from mitsim.transport.from_camera import FromCameraTracer
 from mitsim.transport.integrator import IndirectTracer, Paths
 from mitsim.transport.path_reuse import PathReuseTracer
 from mitsim.transport.records import aligned_grid
+from tests import measured_tables as tables
 from tests.conftest import write_png
 from tests.physics import nestings
 
@@ -41,6 +42,7 @@ EXAMPLES = {
     "bumpmap": (MAP.format("bumpmap", "heights", ROUGH), MAP.format("bumpmap", "heights", BENT)),
     "hair": (HAIR,),
     "mask": (f'<bsdf type="mask">{BENT}</bsdf>', f'<bsdf type="mask">{HALF.format(THIN, BENT)}</bsdf>'),
+    "measured": ('<bsdf type="measured"><string name="filename" value="table.bsdf"/></bsdf>',),
     "mitsim_grating": ('<bsdf type="mitsim_grating"><float name="sigma" value="0.3"/></bsdf>',),
     "normalmap": (NORMALS.format("normalmap", "normals", MATT), NORMALS.format("normalmap", "normals", HAIR)),
     "pplastic": ('<bsdf type="pplastic"><float name="alpha" value="0.2"/></bsdf>',),
@@ -64,6 +66,7 @@ PLATE = '<shape type="rectangle"><transform name="to_world"><translate z="{}"/><
 
 def write_maps(folder: Path) -> None:
     write_png(folder / "heights.png", np.arange(64).reshape(8, 8) * 3)
+    tables.save(folder / "table.bsdf", tables.known(0.3))
     write_png(folder / "normals.png", np.tile(np.array([[160, 110, 240], [100, 140, 240]]), (2, 1, 1)))
 
 
