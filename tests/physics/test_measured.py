@@ -68,7 +68,7 @@ def compared(path: Path, other: dict[str, object], colour: float = 1.0) -> tuple
 
 
 def sent(material: dict[str, object]) -> np.ndarray:
-    """Integral of f cos(theta_o) times the direction, by samples on an even grid, for light from an azimuth of 57 deg."""
+    """Integral of f cos(theta_o) times the direction, by samples on an even grid, for light from an azimuth of 1."""
     even = (np.arange(128) + 0.5) / 128
     s1, s2 = (np.float32(each.ravel()) for each in np.meshgrid(even, even))
     si = dr.zeros(mi.SurfaceInteraction3f, s1.size)

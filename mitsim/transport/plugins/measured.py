@@ -49,9 +49,9 @@ def measured_class() -> type:
             table = read_measured(path)
             self.model, self.spectral = path.name, "spectra" in table
             if self.spectral if mi.is_rgb else mi.is_spectral and not self.spectral:
-                other = "llvm_ad_spectral, or --colour lines" if self.spectral else "llvm_ad_rgb, or a file of spectra"
-                held = "spectra" if self.spectral else "rgb"
-                raise MitsimError(f"{path.name} has {held}, which {mi.variant()} cannot use; take {other}, or mono")
+                kind, held = ("spectral", "spectra") if self.spectral else ("rgb", "rgb")
+                remedy = f"take a {kind} variant, a mono one{', or --colour lines' if self.spectral else ''}"
+                raise MitsimError(f"{path.name} has {held}, which {mi.variant()} cannot use; {remedy}")
             at = [table[each].tolist() for each in ("phi_i", "theta_i")]
             self.isotropic = len(at[0]) <= 2
             # Parts of a turn that an anisotropic table covers, by the material's symmetry.
