@@ -156,9 +156,8 @@ def misfit(png: bytes) -> float:
 
 def plugins() -> str:
     """Markdown that shows the manuals of mitsim's own Mitsuba plugins as they stand in their modules."""
-    sources = [
-        ROOT / "mitsim/transport/plugins" / f"{name}.py" for name in ("lensless", "materials", "measured", "lens")
-    ]
+    names = "lensless", "materials", "measured", "lens", "ies"
+    sources = [ROOT / "mitsim/transport/plugins" / f"{name}.py" for name in names]
     manuals = [ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) for path in sources]
     return "\n\n".join(f"```text\n{manual}\n```" for manual in manuals)
 

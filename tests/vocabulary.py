@@ -80,6 +80,7 @@ def scene(folder: Path, tag: str, plugin: str) -> Path:
     write_png(folder / "colours.png", np.random.default_rng(1).integers(0, 256, (8, 8, 3)))
     write_png(folder / "normals.png", np.broadcast_to([128, 128, 255], (4, 4, 3)))
     measured_tables.save(folder / "table.bsdf", measured_tables.known(0.3))
+    (folder / "lamp.ies").write_text("IES TILT=NONE 1 -1 1 2 1 1 2 0 0 0 1 1 1 0 90 0 100 50")
     (folder / "mesh.ply").write_text(_MESH)
     (folder / "mesh.obj").write_text(_OBJ)
     path = write_small_scene(folder, f"{tag}_{plugin}", 4, pixels=16, mask="open", extra=_extra(tag, plugin))
@@ -107,6 +108,7 @@ def _extra(tag: str, plugin: str) -> str:
             "constant": '<emitter type="constant"><spectrum name="radiance" value="0.1"/></emitter>',
             "directional": '<emitter type="directional"><vector name="direction" x="0" y="0.3" z="1"/></emitter>',
             "envmap": '<emitter type="envmap"><string name="filename" value="grey.png"/></emitter>',
+            "mitsim_ies": '<emitter type="mitsim_ies"><string name="filename" value="lamp.ies"/></emitter>',
             "mitsim_projector": _LENS,
             "point": '<emitter type="point"><point name="position" x="0" y="40" z="200"/></emitter>',
             "projector": "",

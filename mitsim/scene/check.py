@@ -18,7 +18,7 @@ import pydantic
 from mitsim.core.configuration import limits_of
 from mitsim.core.errors import MitsimError, cut, near_name
 from mitsim.devices.camera import PIXELS, CameraGeometry
-from mitsim.scene.headers import FARTHEST, MOST_TEXELS, check_image, check_obj, check_ply, read_measured
+from mitsim.scene.headers import FARTHEST, MOST_TEXELS, check_image, check_obj, check_ply, read_ies, read_measured
 from mitsim.scene.outline import DEEPEST, MOST_ELEMENTS, Outline, Tag
 
 _LARGEST = 1e20
@@ -103,7 +103,7 @@ PLUGINS = {
         "bsdf": "blendbsdf bumpmap circular conductor dielectric diffuse hair mask measured mitsim_glass "
         "mitsim_grating normalmap null plastic polarizer pplastic principled principledthin retarder "
         "roughconductor roughdielectric roughplastic thindielectric twosided",
-        "emitter": "area constant directional envmap mitsim_projector point projector spot",
+        "emitter": "area constant directional envmap mitsim_ies mitsim_projector point projector spot",
         "film": "hdrfilm specfilm",
         "integrator": "direct path ptracer volpath volpathmis",
         "medium": "homogeneous",
@@ -163,7 +163,7 @@ MIRRORS = ("conductor", "dielectric", "mitsim_glass", "plastic", "thindielectric
 """Materials that reflect or refract into single directions."""
 _TURNING, _ALONG = (*BUMPS, "hair", "measured", "mitsim_grating"), ("alpha_u", "alpha_v", "anisotropic")
 """Materials that vary along the surface, and parameters that cause this."""
-SMALL_LAMPS = ("directional", "point", "spot")
+SMALL_LAMPS = ("directional", "mitsim_ies", "point", "spot")
 """Lamps that no path can hit."""
 _VOLUMETRIC = ("volpath", "volpathmis")
 
@@ -276,7 +276,7 @@ def find_unfit(outline: Outline, nodes: Sequence[mi.parser.SceneNode]) -> Unfit:
 # -------- Checks of a scene file
 
 _IMAGES = ("bitmap", "envmap")
-_READERS = (*_IMAGES, "measured", "ply", "obj")
+_READERS = (*_IMAGES, "measured", "mitsim_ies", "ply", "obj")
 _LARGEST_MATERIAL = 256
 """Largest number of objects of one BSDF, because all are compiled into every kernel."""
 _COLOURED = ("blackbody", "d65", "irregular", "mesh_attribute", "mitsim_glass", "mitsim_grating", "regular")
@@ -284,7 +284,7 @@ _PARTING = "mitsim_glass"
 """Material with a dispersive index."""
 _ON_SHAPES = ("area", "mitsim_projector")
 """Emitters that are the surface of a shape."""
-_RIGID = ("mitsim_lensless", "mitsim_projector", "projector")
+_RIGID = ("mitsim_ies", "mitsim_lensless", "mitsim_projector", "projector")
 """Plugins that may only be rotated and moved."""
 _METALS = ("conductor", "roughconductor")
 """Materials that may be coloured metals."""
@@ -432,7 +432,9 @@ def _check_property(checked: CheckedScene, node: mi.parser.SceneNode, name: str)
             raise tag.refusal(name, got, rule)
         error = float(np.abs(turn.T @ turn - np.eye(3)).max())
         if name == "to_world" and plugin in _RIGID and not (error < _RIGID_ERROR and np.linalg.det(turn) > 0):
-            raise tag.refusal(name, f"R^T R {error:.2g} from 1", "a camera or projector is moved and turned only")
+            raise tag.refusal(
+                name, f"R^T R {error:.2g} from 1", "a camera, projector or profile is moved and turned only"
+            )
     elif kind == _Type.ResolvedReference:
         inner = nodes[node.props[name].index()]
         within = inner.props.plugin_name()
@@ -448,7 +450,7 @@ def _check_property(checked: CheckedScene, node: mi.parser.SceneNode, name: str)
     elif kind == _Type.String and name not in ("values", "wavelengths"):
         text = node.props[name]
         if name == "filename" and plugin not in _READERS:
-            raise tag.refusal(name, repr(text), "only bitmap, envmap, measured, ply and obj read a file")
+            raise tag.refusal(name, repr(text), f"only {', '.join(_READERS)} read a file")
         if name == "material" and not re.fullmatch(r"[A-Za-z0-9_-]+", text):
             raise tag.refusal(name, repr(text), "give the name of a material, as Au")
         if name not in ("filename", "material") and ("/" in text or ".." in text):
@@ -497,6 +499,8 @@ def _check_resource(checked: CheckedScene, node: mi.parser.SceneNode) -> None:
         elif plugin == "measured":
             read_measured(path)
             checked.coloured.append(tag)
+        elif plugin == "mitsim_ies":
+            read_ies(path)
         else:
             given, checked.unread[str(path)] = (check_ply if plugin == "ply" else check_obj)(path)
             checked.normals.setdefault(Path(name).name, set()).add(given)

@@ -42,7 +42,7 @@ _LINE = re.compile(
 _TURNED, _BENT = 1e-3, 1e-2
 """Parts of a face's area by which rounding may turn a triangle over, and triangles may exceed it (16 degrees).
 """
-_MOST_TEXT = 64 << 20
+_MOST_TEXT, _MOST_PROFILE, _PROFILE_HEAD = 64 << 20, 4 << 20, 13
 _MEASURED = {
     "phi_i": "p", "theta_i": "t", "ndf": "ab", "sigma": "cd", "vndf": "ptef", "luminance": "ptss", "jacobian": "1",
     "wavelengths": "w", "spectra": "ptwss", "rgb": "pt3ss",
@@ -265,6 +265,35 @@ def _tensors(content: bytes) -> dict[str, tuple[int, int, tuple[int, ...]]]:
         fields[name] = kind, offset, struct.unpack_from(f"<{dimensions}Q", content, at + 11)
         at += 11 + 8 * dimensions
     return fields
+
+
+def read_ies(path: Path) -> tuple[npt.NDArray[Any], npt.NDArray[Any], npt.NDArray[Any]]:
+    """Return vertical angles, horizontal angles [degrees] and candelas by (horizontal, vertical) of an IES profile."""
+    if path.stat().st_size > _MOST_PROFILE:
+        raise ValueError(f"is over {_MOST_PROFILE >> 20} MiB; an IES profile is smaller")
+    head, tilt, body = path.read_bytes().partition(b"TILT=NONE")
+    if not head.startswith(b"IES") or not tilt:
+        raise ValueError("is no IES profile with the line TILT=NONE (LM-63); export it without tilt")
+    try:
+        numbers = np.array(re.split(rb"[\s,]+", body.strip()), dtype=np.float64)
+    except ValueError:
+        numbers = np.full(1, np.nan)
+    if numbers.size < _PROFILE_HEAD or not np.isfinite(numbers).all():
+        raise ValueError("holds words that are no numbers below TILT=NONE, or too few; export it again")
+    (count, turns, kind), rest = numbers[3:6], numbers[_PROFILE_HEAD:]
+    if kind != 1:
+        raise ValueError(f"has photometric type {kind:g}; type C, 1, is read, so export that")
+    if count % 1 or turns % 1 or count < 2 or turns < 1 or rest.size != count + turns + count * turns:
+        raise ValueError(f"claims {count:g} x {turns:g} angles and holds {rest.size} numbers; export it again")
+    vertical, horizontal, candela = np.split(rest, np.cumsum(numbers[3:5].astype(int)))
+    fits = vertical[0] in (0, 90) and vertical[-1] in (90, 180) and horizontal[0] == 0
+    if not fits or horizontal[-1] not in (0, 90, 180, 360):
+        raise ValueError("has angles beyond 0 to 180 and 0 to 0, 90, 180 or 360 degrees; export those of type C")
+    if np.any(np.diff(vertical) <= 0) or np.any(np.diff(horizontal) <= 0):
+        raise ValueError("has angles that do not grow; export it again")
+    if candela.min() < 0 or candela.max() <= 0:
+        raise ValueError("has negative candelas, or no light; export it again")
+    return vertical, horizontal, candela.reshape(horizontal.size, vertical.size)
 
 
 def check_obj(path: Path) -> tuple[bool, str]:

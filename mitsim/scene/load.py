@@ -137,7 +137,6 @@ def _homography(source: FloatArray, target: FloatArray) -> FloatArray:
 # -------- Loading of a scene file
 
 SENSOR_PLUGIN = "mitsim_lensless"
-_SMALL_LAMPS = ("DirectionalEmitter", "PointLight", "SpotLight")
 _FLAT, _TURNED = ("Rectangle", "Disk"), 1e-6
 """Flat shapes, and the difference between parallel normals in single precision."""
 _SMOOTH_BY_CLASS = ("Instance", "SDFGrid")
@@ -272,7 +271,8 @@ def load_scene(
                 raise
     # Groups are in the scene only by their instances.
     tags = checked.tags_of(set(check.PLUGINS["shape"]) - {"shapegroup"})
-    small = [emitter for emitter in emitters if emitter.class_name() in _SMALL_LAMPS]
+    single = [emitter for emitter in emitters if mi.has_flag(emitter.flags(), mi.EmitterFlags.Delta)]
+    small = [emitter for emitter in single if emitter.class_name() != "Projector"]
     flags = [shape.bsdf().flags() for shape in shapes if shape.bsdf()]
     polished = int(mi.BSDFFlags.DeltaReflection) | int(mi.BSDFFlags.DeltaTransmission)
     hidden = any(shape.class_name() == "Instance" for shape in shapes)
@@ -317,7 +317,7 @@ def holds_hair(flags: Any) -> Any:
 # in the tree, and refused where single precision would lose their position, width or brightness.
 
 _CENTRES = {"sphere": "center", "cylinder": "p0"}
-_PLACED = ("point", "spot", "projector", "mitsim_projector")
+_PLACED = ("mitsim_ies", "point", "spot", "projector", "mitsim_projector")
 """Lamps with a position."""
 _SINGLE = ("projector", "obj", "ply", "instance")
 """Objects whose numbers are of single precision already."""

@@ -10,7 +10,7 @@ def register() -> None:
     import mitsuba as mi
 
     from mitsim.core.errors import MitsimError
-    from mitsim.transport.plugins import lens, lensless, materials
+    from mitsim.transport.plugins import ies, lens, lensless, materials
 
     variant = mi.variant()
     if variant is None:
@@ -19,6 +19,7 @@ def register() -> None:
         return
     mi.register_sensor(lensless.PLUGIN, lensless.plugin_class())
     mi.register_emitter(lens.PLUGIN, lens.plugin_class())
+    mi.register_emitter(ies.PLUGIN, ies.plugin_class())
     for name, made in materials.plugin_classes().items():
         mi.register_bsdf(name, made)
     _REGISTERED.add(variant)
