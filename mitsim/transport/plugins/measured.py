@@ -92,11 +92,6 @@ def measured_class() -> type:
             y = -dr.mulsign(mi.Float(1), wi.y) if self.parts > 1 else mi.Float(1)
             return mi.Vector3f(-dr.mulsign(mi.Float(1), wi.x) if self.parts == 4 else y, y, 1)
 
-        def _density(self, wi: mi.Vector3f, m: mi.Vector3f, unit: mi.Point2f, density: mi.Float) -> mi.Float:
-            # From the unit square to half vectors, theta = pi u^2 / 2 and phi = pi (2 v - 1), and to directions.
-            area = 2 * dr.square(dr.pi) * unit.x * dr.sqrt(dr.square(m.x) + dr.square(m.y))
-            return density / (dr.maximum(area, 1e-6) * 4 * dr.dot(wi, m))
-
         def sample(
             self, ctx: mi.BSDFContext, si: Surface, s1: mi.Float, s2: mi.Point2f, active: mi.Bool = True
         ) -> Draw:
@@ -112,7 +107,6 @@ def measured_class() -> type:
             bs.wo = (2 * dr.dot(wi, m) * m - wi) * signs
             value, bs.pdf = self.eval_pdf(ctx, si, bs.wo, active)
             bs.eta, bs.sampled_type = 1, mi.UInt32(+mi.BSDFFlags.GlossyReflection)
-            bs.sampled_component = 0
             return bs, dr.select(bs.pdf > 0, value / bs.pdf, 0)
 
         def eval_pdf(self, ctx: mi.BSDFContext, si: Surface, wo: mi.Vector3f, active: mi.Bool = True) -> Value:
@@ -125,7 +119,9 @@ def measured_class() -> type:
             unit = mi.Point2f(_root(_elevation(m)), turned / (2 * dr.pi) + 0.5)
             unit.y -= dr.floor(unit.y)
             sample, density = self.normals.invert(unit, at, active)
-            pdf = self._density(wi, m, unit, density * self.luminance.eval(sample, at, active))
+            # From the unit square to half vectors, theta = pi u^2 / 2 and phi = pi (2 v - 1), and to directions.
+            area = 2 * dr.square(dr.pi) * unit.x * dr.sqrt(dr.square(m.x) + dr.square(m.y))
+            pdf = density * self.luminance.eval(sample, at, active) / (dr.maximum(area, 1e-6) * 4 * dr.dot(wi, m))
             if ctx.mode == mi.TransportMode.Importance:
                 value = adjoint(self, ctx, si, wo, active)
             else:

@@ -112,7 +112,7 @@ def test_damaged_profiles_are_refused_in_one_line(small_scene: Callable[..., Pat
     wrong = {
         "without tilt": good.replace("NONE\n", "INCLUDE\n"),
         "no numbers": good.replace("\n110.00000", "\nmany"),
-        "no numbers below": good.replace("\n110.00000", "\nnan"),
+        "are no numbers": good.replace("\n110.00000", "\nnan"),
         "type 2": text(kind=2),
         "claims 18 x 37": good.replace("1 19 37", "1 18 37"),
         "claims 19 x 1e": good.replace("1 19 37", "1 19 1e12"),
