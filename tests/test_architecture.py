@@ -497,7 +497,7 @@ SIZES = {
     "sessions": (4, 903),
     "studies": (24, 5000),
     "top level": (5, 525),
-    "transport": (17, 4127),
+    "transport": (17, 4124),
 }
 """Files and lines of code of each room. The limits only ever fall: a change that needs more in one room takes it from
 another, and says which code went."""
