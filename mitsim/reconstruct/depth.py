@@ -401,7 +401,8 @@ def chance_difference(difference: float, variance: float, unknowns: int) -> floa
     return CHANCE * float(np.sqrt(4 * variance * max(difference, 0.0) + 4 * variance**2 * unknowns))
 
 
-def _shifts_searched(factors: Factors, depth_range: tuple[float, float] | None) -> tuple[float, float]:
+def shifts_searched(factors: Factors, depth_range: tuple[float, float] | None) -> tuple[float, float]:
+    """Return the ends of the searched 1/z - 1/z_0 [1/mm], for a range of depths [mm] or the default one."""
     parallax = parallax_of(factors)
     if depth_range is None:
         return -RANGE / parallax.depth_mm, RANGE / parallax.depth_mm
@@ -418,9 +419,16 @@ def _moves(factors: Factors) -> FloatArray:
     return np.array([max(map(abs, each)) for each in ends])
 
 
-def _are_dots(patterns: FloatArray) -> bool:
+def are_dots(patterns: FloatArray) -> bool:
+    """Return True if each pixel is lit by one pattern alone."""
     values = np.sort(patterns, axis=1)
     return not values[:, :-1].any() and bool((values[:, -1] == 1).all())
+
+
+def period_of_dots(factors: Factors, patterns: Sequence[FloatArray]) -> float:
+    """Return the change of 1/z [1/mm] that moves the light of dots onto another dot; inf without a baseline."""
+    moves = _moves(factors)
+    return _period(moves, patterns) if moves.any() else np.inf
 
 
 def _period(moves: FloatArray, patterns: Sequence[FloatArray]) -> float:
@@ -450,11 +458,11 @@ def best_depth(shots: Capture, factors: Factors, depth_range: tuple[float, float
 
     Raises MitsimError without a stated parallax, and ArgumentError for a range that too little of the sensor knows.
     """
-    (first, last), moves, beyond = _shifts_searched(factors, depth_range), _moves(factors), 0.0
+    (first, last), moves, beyond = shifts_searched(factors, depth_range), _moves(factors), 0.0
     inverse, stated = 1 / parallax_of(factors).depth_mm, factors.manifest.noise
     if depth_range is None:
         # A surface beyond the range, but for a period, is within it: only where a range is given that is excluded.
-        periodic = moves.any() and all(map(_are_dots, shots.patterns))
+        periodic = moves.any() and all(map(are_dots, shots.patterns))
         beyond = min(_period(moves, shots.patterns), last) if periodic else last
     tried = first - beyond, last + beyond
     basis = CommonBasis(shots, factors, tried)
@@ -545,7 +553,7 @@ def depth_map(
     Raises MitsimError for other patterns, and without parallax.
     """
     # Dots of any period determine the depth of a flat scene, however far from the calibrated one.
-    ends, inverse = _shifts_searched(factors, depth_range), 1 / parallax_of(factors).depth_mm
+    ends, inverse = shifts_searched(factors, depth_range), 1 / parallax_of(factors).depth_mm
     range_mm, centre = (1 / (inverse + ends[1]), 1 / (inverse + ends[0])), (ends[0] + ends[1]) / 2
     plane = best_depth(shots, factors, range_mm)
     # Any of several depths will do for a start, but the end of a range is the depth of nothing.
@@ -713,7 +721,7 @@ class Arrivals:
     """Places where light arrives, by pixel and change of 1/z [1/mm] between two ``ends``."""
 
     def __init__(self, shots: Capture, factors: Factors, ends: tuple[float, float], beside: float) -> None:
-        if not all(map(_are_dots, shots.patterns)):
+        if not all(map(are_dots, shots.patterns)):
             raise MitsimError("focus map: needs shifting dots, such as dots:7x16, whose displacement depends on depth")
         moves, span = _moves(factors), ends[1] - ends[0]
         self._open = [bool(move * span > 0.5) for move in moves]

@@ -28,6 +28,7 @@ from mitsim.reconstruct.request import IMAGE_FILE, PICTURE_FILE, RESULT_FILE, TI
 from mitsim.reconstruct.solver import Solution, Status, Verdict
 from mitsim.reconstruct.solvers import SOLVERS, Solver
 from mitsim.reconstruct.uncertainty import Uncertainty, rms, uncertainty
+from mitsim.reconstruct.volume import Volume, solve_volume
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -106,7 +107,7 @@ class PointSpreadFit:
 
 # ---- An image and how far to trust it --------------------------------------------------------------------------------
 
-UNCERTAINTY_FILE, DEPTH_FILE = "uncertainty.exr", "depth.exr"
+UNCERTAINTY_FILE, DEPTH_FILE, VOLUME_FILE = "uncertainty.exr", "depth.exr", "volume.exr"
 _INCOMPLETE = "incomplete"
 MADE_OF = "made_of"
 POINT_SPREAD = "psf"
@@ -161,6 +162,11 @@ class Reconstruction(Solution):
         return self.focus if isinstance(self.focus, DepthMap) and not self.focus.doubt else None
 
     @property
+    def volume(self) -> Volume | None:
+        """Reflectance by depth, where it was requested."""
+        return self.focus if isinstance(self.focus, Volume) else None
+
+    @property
     def condition_whole(self) -> float | None:
         """Condition of the whole model; inf when rank deficient."""
         return None if self.condition_sides is None else self.condition_sides[0] * self.condition_sides[1]
@@ -205,6 +211,7 @@ class Reconstruction(Solution):
             "focus_range_mm": self.focus.range_mm if self.focus else None,
             "focus_alternatives": [asdict(other) for other in self.focus.alternatives] if self.focus else None,
             "depths": self.depths.summary() if self.depths else None,
+            "volume_depths_mm": self.volume.depths_mm.tolist() if self.volume else None,
             "misfit": known.summary() if (known := self.misfit or self.fit) else None,
             "uncertainty": (known_to := self.uncertainties) and rms(known_to.total),
             "uncertainty_budget": known_to and known_to.budget,
@@ -221,7 +228,7 @@ class Reconstruction(Solution):
 
     @check_arguments
     def save(self, folder: Path | str, overwrite: bool = False, more: Mapping[str, Any] | None = None) -> Path:
-        """Write image.exr, image.png (for display), result.json, and where known uncertainty.exr and depth.exr.
+        """Write image.exr, image.png (for display), result.json, and uncertainty, depth.exr and volume.exr where known.
 
         Parameters
         ----------
@@ -253,7 +260,8 @@ class Reconstruction(Solution):
         known = self.uncertainties
         errors = known and {"uncertainty": known.total, "random": known.random, "systematic": known.systematic}
         maps = {"depth_mm": self.depths.mm, "confidence": self.depths.confidence} if self.depths else {}
-        for name, arrays in ((UNCERTAINTY_FILE, errors), (DEPTH_FILE, maps)):
+        slices = {f"slice_{k:03d}": each for k, each in enumerate(self.volume.slices)} if self.volume else {}
+        for name, arrays in ((UNCERTAINTY_FILE, errors), (DEPTH_FILE, maps), (VOLUME_FILE, slices)):
             channels[name] = {channel: values.astype(np.float32) for channel, values in (arrays or {}).items()}
         checksums = {}
         for name, values in channels.items():
@@ -388,6 +396,8 @@ def reconstruct_request(
         with clock.stage("focus"):
             if request.focus == "map":
                 focus = depth_map(shots, factors, lam, request.depth_range)
+            elif request.focus == "volume":
+                focus = solve_volume(shots, factors, request, lam)
             elif request.focus == "auto":
                 focus = best_depth(shots, factors, request.depth_range)
             else:
@@ -403,17 +413,23 @@ def reconstruct_request(
     with clock.stage("accumulate"):
         data = accumulate(shots, factors, solver, **request.iterative)
     with clock.stage("solve"):
-        if depths:
+        if isinstance(focus, Volume):
+            solution = focus.solution
+        elif depths:
             solved = Status(Verdict.SOLVED, "Solved: a depth and a reflectance for each projector pixel")
             residual = float(np.sqrt(depths.left_over / depths.energy))
             solution = Solution(depths.image, depths.lam, residual, solved)
         else:
             solution = data.solution(lam)
     with clock.stage("misfit"):
-        data, solution, misfit = _judge(data, solution, depths, lam)
+        # Depths in steps of a pixel of parallax leave more than noise, and the residual states it.
+        misfit: Misfit | None = None
+        if not isinstance(focus, Volume):
+            data, solution, misfit = _judge(data, solution, depths, lam)
     with clock.stage("uncertainty"):
         shown = misfit.chi_square if misfit else 1.0
-        uncertainties = uncertainty(data, solution, shown) if solver.linear and not depths else None
+        one_depth = not (depths or isinstance(focus, Volume))
+        uncertainties = uncertainty(data, solution, shown) if solver.linear and one_depth else None
         if uncertainties and misfit and misfit.picture and shots.manifest.plan is None:
             # Of a simulated run the lamp and the place of every frame are known.
             frames = misfit.picture.uncertainty(solution.image)

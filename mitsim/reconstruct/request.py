@@ -68,16 +68,16 @@ class ImageRequest(Options):
     """lambda >= 0 in the unit of (Phi_L Phi_R)^2, for ``tv`` the weight of the total variation."""
     method: Any = option(TIKHONOV, method_names(), metavar="NAME|MODEL.pt", kind=str, complete=lambda: METHODS)
     """One of :data:`METHODS`, or a :class:`mitsim.reconstruct.solvers.Solver`, such as a trained network."""
-    focus: float | Literal["auto", "map"] | None = option(
+    focus: float | Literal["auto", "map", "volume"] | None = option(
         None,
-        "depth of the scene [mm]; auto: estimate it; map: estimate one for each pixel, from dots patterns; by default "
-        "the depth of the calibration",
-        metavar="auto|MM|map",
+        "depth of the scene [mm]; auto: estimate it; map: estimate one for each pixel, from dots patterns; volume: "
+        "several for each pixel; by default the depth of the calibration",
+        metavar="auto|MM|map|volume",
     )
     depth_range: Two = option(
         None,
-        "with focus auto or map: nearest and farthest depth to try [mm]; by default 1/z differs by at most a quarter "
-        "from that of the calibration",
+        "with focus auto, map or volume: nearest and farthest depth to try [mm]; by default 1/z differs by at most a "
+        "quarter from that of the calibration",
         metavar="A:B",
         read=_two("depth_range", "give the nearest and the farthest depth [mm], such as 350:450"),
     )
@@ -89,7 +89,10 @@ class ImageRequest(Options):
         read=_two("bounds", "give the least and the largest number, such as 0:1 or 0:", -math.inf, math.inf),
     )
     iterations: int | None = option(
-        None, "with nonnegative or tv: limit of the iterations; by default 5000, or 300 with --psf", min=1, metavar="N"
+        None,
+        "with nonnegative or tv: limit of the iterations; by default 5000, or 300 with --psf or --focus volume",
+        min=1,
+        metavar="N",
     )
 
     def model_post_init(self, context: object) -> None:
@@ -107,12 +110,12 @@ class ImageRequest(Options):
             words = f"give a finite number of at least 0, or auto; at most {_MOST:g}"
             raise ArgumentError("lam", f"{short_text(lam)}: {words}")
         if not (focus is None or self.looks_for_depth or 0 < focus <= _MOST):
-            raise ArgumentError("focus", f"{short_text(focus)}: give a depth above 0 mm, auto or map")
+            raise ArgumentError("focus", f"{short_text(focus)}: give a depth above 0 mm, auto, map or volume")
         if ends := self.depth_range:
             if not 0 < ends[0] < ends[1] <= _MOST:
                 raise ArgumentError("depth_range", f"{ends}: give two depths above 0 mm, the smaller one first")
             if not self.looks_for_depth:
-                raise ArgumentError("depth_range", f"{ends}: comes with focus auto or map alone, which look for depths")
+                raise ArgumentError("depth_range", f"{ends}: comes with focus auto, map or volume alone")
         if ends := self.bounds:
             within = all(abs(end) <= _MOST or abs(end) == math.inf for end in ends)
             if not (within and ends[0] < ends[1] and ends[0] <= _MOST and ends[1] >= -_MOST):
@@ -120,6 +123,8 @@ class ImageRequest(Options):
         for name, value in self.iterative.items():
             if method not in (NONNEGATIVE, TV):
                 raise ArgumentError(name, f"{value}: come with method {NONNEGATIVE} or {TV}; {method} has none")
+        if focus == "volume" and method not in (TIKHONOV, NONNEGATIVE, TV):
+            raise ArgumentError("method", f"{method}: volumes come with {TIKHONOV}, {NONNEGATIVE} or {TV}")
         if focus == "map" and method != TIKHONOV:
             raise ArgumentError("method", f"{method}: depths by pixel come with tikhonov alone")
 
@@ -141,7 +146,7 @@ class ImageRequest(Options):
 
     @property
     def looks_for_depth(self) -> bool:
-        return self.focus in ("auto", "map")
+        return self.focus in ("auto", "map", "volume")
 
     def check_point_spread(self, reduce: int) -> None:
         if isinstance(reduce, bool) or not isinstance(reduce, int) or not 1 <= reduce <= MOST_REDUCED:

@@ -252,16 +252,17 @@ def _norm(values: FloatArray) -> float:
 
 
 def slopes_of(image: FloatArray) -> FloatArray:
-    return np.stack([np.diff(image, axis=axis, append=image.take([-1], axis)) for axis in (0, 1)])
+    """Return the differences (axes, ...) of neighbouring numbers of an image or a volume, 0 beyond the last."""
+    return np.stack([np.diff(image, axis=axis, append=image.take([-1], axis)) for axis in range(image.ndim)])
 
 
 def slopes_adjoint(slopes: FloatArray) -> FloatArray:
-    down, across = slopes[0, :-1], slopes[1, :, :-1]
+    """Return the adjoint of :func:`slopes_of`."""
     total = np.zeros(slopes.shape[1:], slopes.dtype)
-    total[1:] += down
-    total[:-1] -= down
-    total[:, 1:] += across
-    total[:, :-1] -= across
+    for axis, along in enumerate(slopes):
+        sums, part = np.moveaxis(total, axis, 0), np.moveaxis(along, axis, 0)[:-1]
+        sums[1:] += part
+        sums[:-1] -= part
     return total
 
 

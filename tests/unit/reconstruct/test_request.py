@@ -28,9 +28,9 @@ REFUSED = [
     *(((lam, "tv", None), "lam", "at least 0, or auto") for lam in (-1e-300, math.inf, math.nan)),
     (("none", "tv", None), "lam", "give a number or 'auto'"),
     *((("auto", "tv", focus), "focus", "above 0 mm") for focus in (0.0, -1.0, math.inf, math.nan)),
-    (("auto", "tv", "near"), "focus", "give a number or 'auto' or 'map'"),
+    (("auto", "tv", "near"), "focus", "give a number or 'auto', 'map' or 'volume'"),
     *((("auto", method, "map"), "method", "tikhonov alone") for method in ("markov", "nonnegative", "tv")),
-    (("auto", "tikhonov", 350.0, (300.0, 400.0)), "depth_range", "focus auto or map alone"),
+    (("auto", "tikhonov", 350.0, (300.0, 400.0)), "depth_range", "focus auto, map or volume alone"),
     (("auto", "tikhonov", "map", (400.0, 300.0)), "depth_range", "the smaller one first"),
 ]
 
