@@ -490,7 +490,7 @@ SIZES = {
     "light": (6, 1672),
     "optics": (7, 1751),
     "planner": (6, 1627),
-    "reconstruct": (16, 5499),
+    "reconstruct": (18, 5666),
     "report": (6, 1879),
     "scene": (5, 1438),
     "sensor": (4, 1105),
