@@ -108,7 +108,10 @@ class Planes:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Volume(DepthMap):
-    """Reflectances ``slices`` (D, n, n') at ``depths_mm`` (D,); ``image`` is their sum, ``mm`` their mean depth."""
+    """Reflectances ``slices`` (D, n, n') at ``depths_mm`` (D,); ``image`` is their sum, ``mm`` their mean depth.
+
+    ``confidence`` is the largest part of a pixel's light at two neighbouring depths.
+    """
 
     slices: FloatArray
     depths_mm: FloatArray
