@@ -494,7 +494,7 @@ SIZES = {
     "report": (6, 1798),
     "scene": (5, 1349),
     "sensor": (4, 1105),
-    "sessions": (4, 903),
+    "sessions": (4, 918),
     "studies": (24, 5000),
     "top level": (5, 525),
     "transport": (15, 3948),
