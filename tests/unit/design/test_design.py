@@ -238,10 +238,12 @@ def test_the_exposure_for_a_psnr_reaches_it(stand: Stand) -> None:
 @pytest.mark.slow
 def test_a_design_is_as_good_as_predicted(tmp_path: Path) -> None:
     """Two seeds, frames good to 1e-3: all four masks within 0.5 dB, and the design is the best of them."""
-    goal = Goal(**(GOAL | {"evaluations": 60}), starts=1, seeds=2, accuracy=1e-3)
+    goal = Goal(**(GOAL | {"evaluations": 60}), starts=1, seeds=2, accuracy=1e-3, scene_distances_mm=(400.0, 380.0))
     found = ms.design(goal, tmp_path / "out")
     for each in found.candidates:
         assert abs(each.rendered - each.predicted) < 0.5, each.name
+    aligned, near = found.distances.values()
+    assert near != aligned == pytest.approx(found.candidates[0].predicted, abs=0.3)
     assert all(found.candidates[0].rendered > each.rendered for each in found.candidates[1:])
     for name in ("design.json", "report.html", "masks.png", "images.png", "design/camera.toml", "design/mask.svg"):
         assert (tmp_path / "out" / name).stat().st_size > 0
