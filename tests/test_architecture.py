@@ -483,7 +483,7 @@ SIZES = {
     "calibrate": (4, 963),
     "cli": (6, 1538),
     "core": (17, 3086),
-    "design": (9, 1573),
+    "design": (9, 1572),
     "devices": (9, 2203),
     "exchange": (5, 1299),
     "learn": (5, 1190),
@@ -495,7 +495,7 @@ SIZES = {
     "scene": (5, 1349),
     "sensor": (4, 1105),
     "sessions": (4, 918),
-    "studies": (24, 5000),
+    "studies": (24, 5002),
     "top level": (5, 525),
     "transport": (15, 3948),
 }
