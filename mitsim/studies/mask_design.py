@@ -200,7 +200,7 @@ def design(
             candidates=tuple(proved),
             bounds=tuple(own.active_bounds(code)),
             distances=dict(zip((f"{mm:g} mm" for mm in distances), judged, strict=True)),
-            sensitivity=sensitivity(own, code),
+            sensitivity=sensitivity(stand, asked, best.choice, own, code),
             seconds_for_psnr=None if asked.wanted_psnr_db is None else seconds_for(own, code, asked),
             complete=complete,
             seconds=job.clock.seconds(),

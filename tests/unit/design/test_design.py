@@ -225,13 +225,18 @@ def test_pictures_and_doses_are_judged_together_or_alone(stand: Stand, tmp_path:
 
 
 def test_the_exposure_for_a_psnr_reaches_it(stand: Stand) -> None:
-    """(Planted: the sign of a loss; seconds of the goal in place of those found.)"""
+    """(Planted: the sign of a loss; seconds of the goal in place of those found; distances exchanged.)"""
     goal = Goal(**GOAL, wanted_psnr_db=25.0)
     code = (search := Search(objectives(stand, goal, CHOICE))).maximum_length().code
     seconds = seconds_for(search, code, goal)
     (again,) = objectives(stand, goal.model_copy(update={"exposure_total_s": seconds}), CHOICE)
     assert again((code, code)).psnr_db == pytest.approx(25.0, abs=0.02)
-    assert sensitivity(search, code)["a tenth of the light"] < -0.5
+    changes = sensitivity(stand, goal, CHOICE, search, code)
+    assert changes["a tenth of the light"] < -0.5
+    (far,) = objectives(stand, goal.model_copy(update={"scene_distances_mm": (440.0,)}), CHOICE)
+    (here,) = objectives(stand, goal, CHOICE)
+    moved = far((code, code)).psnr_db - here((code, code)).psnr_db
+    assert changes["a scene and its calibration a tenth farther away"] == pytest.approx(moved, abs=1e-3)
     assert seconds_for(search, code, goal.model_copy(update={"wanted_psnr_db": 99.0})) is None
 
 
