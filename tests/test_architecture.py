@@ -483,7 +483,7 @@ SIZES = {
     "calibrate": (4, 963),
     "cli": (6, 1538),
     "core": (17, 3086),
-    "design": (9, 1574),
+    "design": (9, 1581),
     "devices": (9, 2203),
     "exchange": (5, 1299),
     "learn": (5, 1190),
