@@ -265,7 +265,7 @@ def run_search(goal: Goal, folder: Path, job: Job, every: dict[Choice, Search]) 
             keep("design", choice, found, search)
             job.progress("search", (number + (index + 1) / goal.starts) / len(order))
         cyclic = re.sub("^dots:", "cyclic:", choice.patterns)
-        if masks and cyclic in goal.patterns:
+        if masks and cyclic.startswith("cyclic:") and cyclic in goal.patterns:
             mask = min(masks, key=lambda each: each.score)
             if not choice.lit:
                 keep(FOR_DOTS, choice, mask, search)

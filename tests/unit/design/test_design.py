@@ -126,6 +126,13 @@ def test_paths_of_a_goal_count_from_its_file(tmp_path: Path) -> None:
     assert goal.patterns == (str(tmp_path / "p.npy"), "dots:3") and goal.pictures == str(tmp_path / "prints")
 
 
+def test_families_other_than_dots_are_not_made_cyclic(stand: Stand, tmp_path: Path) -> None:
+    """(Planted: codes are sought for each family of the goal, which ended a search for uniform light.)"""
+    goal = Goal(**GOAL | {"feature_um": (240.0,)}, starts=1, patterns=("uniform", "random:2"))
+    run_search(goal, tmp_path, Job(), every := searches(stand, goal))
+    assert [(choice.patterns, choice.lit) for choice in every] == [("uniform", ""), ("random:2", "")]
+
+
 def test_a_resumed_search_ends_as_one_without_a_stop(stand: Stand, tmp_path: Path) -> None:
     """Cyclic patterns begin with dots, and are in a file by which a capture shows them. Damaged work is refused.
     (Planted: codes of any length.)"""
