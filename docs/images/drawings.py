@@ -398,7 +398,7 @@ def predicted() -> Figure:
     FigureCanvasAgg(figure)
     drift, light, seconds = figure.subplots(1, 3)
     rows = [
-        [number.split(" +- ") for number in row[-3:-1]] for row in _table("studies.md", "| kind | what | amount | meas")
+        [number.split(" +- ") for number in row[-3:-1]] for row in _table("studies.md", "| kind | amount | measured")
     ]
     measured, foretold = (np.array([[float(part) for part in row[side]] for row in rows]) for side in (0, 1))
     drift.errorbar(foretold[:, 0], measured[:, 0], measured[:, 1], foretold[:, 1], fmt="o", ms=4, lw=0.8, color=BLUE)

@@ -265,7 +265,7 @@ def run_search(goal: Goal, folder: Path, job: Job, every: dict[Choice, Search]) 
             keep("design", choice, found, search)
             job.progress("search", (number + (index + 1) / goal.starts) / len(order))
         cyclic = re.sub("^dots:", "cyclic:", choice.patterns)
-        if masks and cyclic in goal.patterns:
+        if masks and cyclic.startswith("cyclic:") and cyclic in goal.patterns:
             mask = min(masks, key=lambda each: each.score)
             if not choice.lit:
                 keep(FOR_DOTS, choice, mask, search)
@@ -329,15 +329,22 @@ def write_camera(folder: Path, bench: Apparatus, candidate: Candidate) -> Path:
 # -------- What a mask is worth
 
 
-def sensitivity(search: Search, code: FloatArray) -> dict[str, float]:
-    """Return the expected change [dB] by a hundredth of the features made wrongly, and by a tenth of the light."""
+def sensitivity(stand: Stand, goal: Goal, choice: Choice, search: Search, code: FloatArray) -> dict[str, float]:
+    """Return the expected change [dB] by features that are made wrongly, by less light and by a farther scene."""
     here, random = search.score(code).score, stream(search.seed, "flaws")
     worse = []
     for _ in range(8):
         places = random.choice(search.used, max(round(len(search.used) / 100), 1), replace=False)
         worse.append(search.score(np.abs(code - np.isin(np.arange(len(code)), places))).score)
-    flaws, dark = float(np.mean(worse)) / here, _score(search, code, 0.1) / here
-    losses = {"one feature in a hundred wrong": flaws, "a tenth of the light": dark}
+    near = min(goal.scene_distances_mm or (stand.bench.geometry.scene_distance,))
+    both = objectives(stand, goal.model_copy(update={"scene_distances_mm": (near, 1.1 * near)}), choice)
+    half = len(both) // 2
+    before, after = (replace(search, objectives=each).score(code).score for each in (both[:half], both[half:]))
+    losses = {
+        "one feature in a hundred wrong": float(np.mean(worse)) / here,
+        "a tenth of the light": _score(search, code, 0.1) / here,
+        "a scene and its calibration a tenth farther away": after / before,
+    }
     return {name: -10 * math.log10(loss) for name, loss in losses.items()}
 
 

@@ -25,7 +25,7 @@ from mitsim.core.picture_files import picture_files
 from mitsim.design.predictor import ELSEWHERE, Camera, Errors, Noise, Predictor, Scene, decibels
 from mitsim.devices.patterns import Lighting, PatternFamily
 from mitsim.devices.sensor import digital_of
-from mitsim.devices.session import load_recipe
+from mitsim.devices.session import Drift, load_recipe
 from mitsim.light.light import Group, trace_groups
 from mitsim.light.passes import LightEstimate, Simulation
 from mitsim.light.settings import Settings
@@ -381,6 +381,8 @@ def lacks(stand: Stand, model: Predictor, session: Session, asked_lambda: bool =
     """Yield the causes that the prediction lacks, with their size."""
     bench, scene, energy = stand.bench, stand.scene, float(np.square(stand.truth).mean())
     yield from session.warnings
+    if session.recipe.drift != Drift():
+        yield "drift: the recipe's table [drift] is not in this prediction; `mitsim study drift` measures its cost"
     if model.prepared.spare <= 0 and not asked_lambda:
         yield "too few data: a solver cannot estimate noise and choose lambda from these frames; take more patterns"
     if model.seen is None and scene.beyond > _SMALL:

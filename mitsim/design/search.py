@@ -90,9 +90,8 @@ class Search:
             mean = float(logs.max() + np.log(scaled.mean()) / _SHARPNESS)
             weights = scaled / scaled.sum()
         slope = np.zeros(self.features)
-        if slopes:
-            for weight, value in zip(weights, values, strict=True):
-                slope += weight * sum(value.slopes) / value.total
+        for weight, value in zip(weights, values, strict=True):
+            slope += weight * sum(value.slopes) / value.total  # none without slopes
         return Scored(math.exp(mean), slope, [value.lam for value in values])
 
     def starts(self) -> Iterator[tuple[str, FloatArray]]:

@@ -280,9 +280,9 @@ def rank_above_noise(phi: FloatArray, error: float, values: FloatArray | None = 
 def _least(phi: FloatArray, error: float, values: FloatArray) -> float:
     if not phi.any():
         return 0.0
-    # Three standard deviations above the mean of chi-square of m degrees.
+    # Six standard deviations above the mean of chi-square of m degrees.
     deviation, rows = error * np.linalg.norm(phi) / np.sqrt(phi.size), phi.shape[0]
-    return max(float(deviation * np.sqrt(rows + 3 * np.sqrt(2 * rows))), _rounding(phi, values))
+    return max(float(deviation * np.sqrt(rows + 6 * np.sqrt(2 * rows))), _rounding(phi, values))
 
 
 def _rounding(phi: FloatArray, values: FloatArray) -> float:

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from pydantic import BaseModel, Field
 
 from mitsim import verbs
-from mitsim.bench.request import NO, Exposure, Opening, Request, SessionRequest, Task
+from mitsim.bench.request import NO, Exposure, Opening, PredictRequest, Request, SessionRequest, Task
 from mitsim.core import files
 from mitsim.core.colour_files import MOSAIC, RUN, is_coloured, open_lines
 from mitsim.core.configuration import Configuration, refuse_together, takes, validate
@@ -122,7 +122,7 @@ def run(
     job: Job | None = None,
     **options: Any,
 ) -> SessionResult:
-    """Run the steps of a session: capture, calibrate, reconstruct, study, design and export, each into its own folder.
+    """Run the steps of a session, such as predict, capture, calibrate and reconstruct, each into its own folder.
 
     Parameters
     ----------
@@ -312,6 +312,19 @@ class _Steps:
 
     # ---- A verb each ----
 
+    def _predict(self, step: session_file.Step) -> Work:
+        asked = PredictRequest(**_with_recipe(step.of(PredictRequest)))
+        self.opening.check(self.session.scene["scene"], asked.patterns, asked.timing)
+        yield
+        self.bench.family(asked.patterns, asked.seed)
+        yield
+        from mitsim.design.predict import predict
+
+        found = predict(self.bench, asked, self.job.apart("predict "))
+        with files.output_folder(self.folder / step.output, overwrite=self.asked.resume) as folder:
+            files.write_json(folder / "prediction.json", found.payload())
+        return f"Predicted image under {found.patterns}, PSNR {found.psnr_db:.1f} dB", found.warnings
+
     def _transport(self, step: session_file.Step) -> Work:
         asked = step.of(Request)
         yield from self._asked(Request(**asked), None)
@@ -332,11 +345,7 @@ class _Steps:
         return frames_headline([run.summary() for run in runs.values()]), reasons
 
     def _calibrate(self, step: session_file.Step) -> Work:
-        values, colour = step.of(SessionRequest), step.values.get("colour", NO)
-        if (own := values.get("recipe")) is not None:
-            table = isinstance(own, Mapping)
-            values["recipe"] = validate(SessionRecipe, dict(own), "recipe") if table else load_recipe(own)
-        asked = SessionRequest(**values)
+        asked, colour = SessionRequest(**_with_recipe(step.of(SessionRequest))), step.values.get("colour", NO)
         recipe = asked.recipe or load_recipe()
         if colour != NO:
             recipe.of_one_depth()
@@ -419,6 +428,14 @@ class _Steps:
         again = self.asked.resume and not pictures
         found = export(run, overwrite=again, **how)
         return f"Exported {found['frames']} frames as {found['format']}", ()
+
+
+def _with_recipe(values: dict[str, Any]) -> dict[str, Any]:
+    """Return the ``values`` of a step with the recipe that its file or table describes."""
+    if (own := values.get("recipe")) is not None:
+        table = isinstance(own, Mapping)
+        values["recipe"] = validate(SessionRecipe, dict(own), "recipe") if table else load_recipe(own)
+    return values
 
 
 def _checksums(place: Path) -> dict[str, str]:

@@ -16,7 +16,7 @@ import tomli_w
 from pydantic import BaseModel, Field
 from pydantic.fields import FieldInfo
 
-from mitsim.bench.request import NO, Coloured, Opening, Planned, Request, SessionRequest
+from mitsim.bench.request import NO, Coloured, Opening, Planned, PredictRequest, Request, SessionRequest
 from mitsim.core.colour_files import COLOUR, IMAGE, KINDS, is_coloured, open_lines, spectral_of
 from mitsim.core.configuration import (
     FilePath,
@@ -80,6 +80,10 @@ class _Scene(Opening):
     scene: FilePath
 
 
+class _Prediction(_Placed, PredictRequest):
+    recipe: Annotated[Any, validated_by(_recipe)] = None
+
+
 class _Light(_Placed, Planned):
     pass
 
@@ -121,6 +125,7 @@ class _Export(Exported):
 
 TABLES: dict[str, type[Options]] = {
     "scene": _Scene,
+    "predict": _Prediction,
     "transport": _Light,
     "capture": _Capture,
     "calibrate": _Calibration,
@@ -132,7 +137,7 @@ TABLES: dict[str, type[Options]] = {
 """Model of each table, in the order in which the steps are taken."""
 SEVERAL = "reconstruct", "study", "export"
 """Tables that may be there more than once, as ``[[reconstruct]]``."""
-OF_A_BENCH = "transport", "capture", "calibrate"
+OF_A_BENCH = "predict", "transport", "capture", "calibrate"
 """Verbs that open the scene."""
 FOLDERS = {"capture": "run", "calibrate": "calibration", "reconstruct": "image"}
 """Where the results of some steps go; those of others are called like their table."""

@@ -183,7 +183,9 @@ def design(
                 proved.append(prove(asked, each, file, job.apart(f"{each.name} ")))
         best, *simple = proved
         own, code, distances = every[best.choice], best.found.code, asked.scene_distances_mm
-        first = own.objectives[:: len(own.objectives) // len(distances)] if distances else ()
+        part = len(own.objectives) // max(len(distances), 1)
+        parts = (own.objectives[k * part :][:part] for k in range(len(distances)))
+        judged = (-10 * math.log10(replace(own, objectives=each).score(code).score) for each in parts)
         texts = dict.fromkeys(text for each in proved for text in each.warnings)
         warnings = [f"{', '.join(each.name for each in proved if text in each.warnings)}: {text}" for text in texts]
         if best.rendered < best.predicted - _SHORT_DB:
@@ -197,8 +199,8 @@ def design(
         found = Design(
             candidates=tuple(proved),
             bounds=tuple(own.active_bounds(code)),
-            distances={f"{mm:g} mm": one((code, code)).psnr_db for mm, one in zip(distances, first, strict=True)},
-            sensitivity=sensitivity(own, code),
+            distances=dict(zip((f"{mm:g} mm" for mm in distances), judged, strict=True)),
+            sensitivity=sensitivity(stand, asked, best.choice, own, code),
             seconds_for_psnr=None if asked.wanted_psnr_db is None else seconds_for(own, code, asked),
             complete=complete,
             seconds=job.clock.seconds(),

@@ -267,11 +267,21 @@ def test_design(call: Call, lab: Any, tmp_path: Path, monkeypatch: pytest.Monkey
         assert words in line
     found = call("design", asked(), *options, "--resume").payload
     assert found.keys() == {
-        *("headline", "psnr", "candidates", "bounds", "sensitivity", "seconds_for_psnr", "complete", "seconds"),
+        *(
+            "headline",
+            "psnr",
+            "candidates",
+            "bounds",
+            "distances",
+            "sensitivity",
+            "seconds_for_psnr",
+            "complete",
+            "seconds",
+        ),
         *("output", "warnings"),
     }
     assert (out / "search.json").read_bytes() == kept and found["complete"] and found["seconds_for_psnr"] is None
-    keys = "name feature_um mask_distance_mm patterns origin code evaluations exposure_total_s psnr_of_search "
+    keys = "name feature_um mask_distance_mm patterns origin code evaluations exposure_total_s cases psnr_of_search "
     keys += "psnr_predicted causes psnr_rendered psnr_scatter session_exposure_s warnings"
     for each in found["candidates"]:
         assert each.keys() == {*keys.split()} and number(each["psnr_rendered"], 5, 60)

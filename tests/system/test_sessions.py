@@ -75,6 +75,22 @@ def test_what_no_session_makes_is_refused(refused: Refused, lab: Any, tmp_path: 
     assert "capture.patterns: 'dotz'" in refused("run", "demo", "-D", "capture.patterns=dotz", "-o", "new")
 
 
+def test_a_session_predicts_as_the_verb_does(call: Call, lab: Any, tmp_path: Path) -> None:
+    """(Planted: the recipe not read; the patterns of the default.)"""
+    recipe = 'board_reflectance = 0.9\nexposure_fraction = 2e-3\nsigned_capture = "uniform"\nsource = "a lamp"\n'
+    scene = f'[scene]\nscene = "{lab.scene}"\ncamera = "{lab.camera}"\nprojector = "{lab.projector}"\n'
+    (tmp_path / "recipe.toml").write_text(recipe)
+    (tmp_path / "s.toml").write_text(f'{scene}[predict]\npatterns = "dots:4"\n[predict.recipe]\n{recipe}')
+    devices = lab.scene, "--camera", lab.camera, "--projector", lab.projector
+    asked = call("predict", *devices, "--patterns", "dots:4", "--recipe", tmp_path / "recipe.toml", "--json")
+    done = call("run", tmp_path / "s.toml", "-o", tmp_path / "out", "--json", "--no-pictures")
+    found = json.loads((tmp_path / "out" / "predict" / "prediction.json").read_text())
+    assert found["psnr"] == asked.payload["psnr"] and found["causes"] == asked.payload["causes"]
+    assert done.payload["steps"][0]["says"] == f"Predicted image under dots:4, PSNR {found['psnr']:.1f} dB"
+    again = call("run", tmp_path / "s.toml", "-o", tmp_path / "out", "--resume", "--json", "--no-pictures")
+    assert done.code == again.code == asked.code and again.payload["steps"][0]["left_alone"]
+
+
 @pytest.mark.slow
 def test_a_session_file_repeats_a_figure_bit_by_bit(call: Call, lab: Any, imaged: Path, tmp_path: Path) -> None:
     """Frames, truth, factors and image of three commands, by one file; and what is finished is left alone: by the same

@@ -126,6 +126,13 @@ def test_paths_of_a_goal_count_from_its_file(tmp_path: Path) -> None:
     assert goal.patterns == (str(tmp_path / "p.npy"), "dots:3") and goal.pictures == str(tmp_path / "prints")
 
 
+def test_families_other_than_dots_are_not_made_cyclic(stand: Stand, tmp_path: Path) -> None:
+    """(Planted: codes are sought for each family of the goal, which ended a search for uniform light.)"""
+    goal = Goal(**GOAL | {"feature_um": (240.0,)}, starts=1, patterns=("uniform", "random:2"))
+    run_search(goal, tmp_path, Job(), every := searches(stand, goal))
+    assert [(choice.patterns, choice.lit) for choice in every] == [("uniform", ""), ("random:2", "")]
+
+
 def test_a_resumed_search_ends_as_one_without_a_stop(stand: Stand, tmp_path: Path) -> None:
     """Cyclic patterns begin with dots, and are in a file by which a capture shows them. Damaged work is refused.
     (Planted: codes of any length.)"""
@@ -225,23 +232,30 @@ def test_pictures_and_doses_are_judged_together_or_alone(stand: Stand, tmp_path:
 
 
 def test_the_exposure_for_a_psnr_reaches_it(stand: Stand) -> None:
-    """(Planted: the sign of a loss; seconds of the goal in place of those found.)"""
+    """(Planted: the sign of a loss; seconds of the goal in place of those found; distances exchanged.)"""
     goal = Goal(**GOAL, wanted_psnr_db=25.0)
     code = (search := Search(objectives(stand, goal, CHOICE))).maximum_length().code
     seconds = seconds_for(search, code, goal)
     (again,) = objectives(stand, goal.model_copy(update={"exposure_total_s": seconds}), CHOICE)
     assert again((code, code)).psnr_db == pytest.approx(25.0, abs=0.02)
-    assert sensitivity(search, code)["a tenth of the light"] < -0.5
+    changes = sensitivity(stand, goal, CHOICE, search, code)
+    assert changes["a tenth of the light"] < -0.5
+    (far,) = objectives(stand, goal.model_copy(update={"scene_distances_mm": (440.0,)}), CHOICE)
+    (here,) = objectives(stand, goal, CHOICE)
+    moved = far((code, code)).psnr_db - here((code, code)).psnr_db
+    assert changes["a scene and its calibration a tenth farther away"] == pytest.approx(moved, abs=1e-3)
     assert seconds_for(search, code, goal.model_copy(update={"wanted_psnr_db": 99.0})) is None
 
 
 @pytest.mark.slow
 def test_a_design_is_as_good_as_predicted(tmp_path: Path) -> None:
     """Two seeds, frames good to 1e-3: all four masks within 0.5 dB, and the design is the best of them."""
-    goal = Goal(**(GOAL | {"evaluations": 60}), starts=1, seeds=2, accuracy=1e-3)
+    goal = Goal(**(GOAL | {"evaluations": 60}), starts=1, seeds=2, accuracy=1e-3, scene_distances_mm=(400.0, 380.0))
     found = ms.design(goal, tmp_path / "out")
     for each in found.candidates:
         assert abs(each.rendered - each.predicted) < 0.5, each.name
+    aligned, near = found.distances.values()
+    assert near != aligned == pytest.approx(found.candidates[0].predicted, abs=0.3)
     assert all(found.candidates[0].rendered > each.rendered for each in found.candidates[1:])
     for name in ("design.json", "report.html", "masks.png", "images.png", "design/camera.toml", "design/mask.svg"):
         assert (tmp_path / "out" / name).stat().st_size > 0

@@ -14,7 +14,7 @@ import mitsim as ms
 from mitsim.calibrate.board_session import Session
 from mitsim.core.errors import ArgumentError
 from mitsim.design.predict import Stand
-from mitsim.devices.session import MOST_REPEATS, SessionRecipe, load_recipe, recipe_text
+from mitsim.devices.session import MOST_REPEATS, Drift, SessionRecipe, load_recipe, recipe_text
 
 
 def test_a_recipe_is_written_as_it_is_read(tmp_path: Path) -> None:
@@ -54,9 +54,13 @@ def changed(**more: object) -> SessionRecipe:
 def test_the_light_is_the_least_that_reaches_the_quality(bench: Any, kept_plans: None, fraction: float) -> None:
     """A hundredth less of an exposure, or one repeat less, does not reach it by the prediction of the image.
 
-    (Planted: the light rounded to nearest; a repeat too many; noise of the recipe's own light for all doses.)
+    A drift, which the prediction lacks, is named. (Planted: the light rounded to nearest; a repeat too many; noise of
+    the recipe's own light for all doses; no word of the drift.)
     """
-    plan = ms.plan_calibration(bench, 31.0, "dots:2", accuracy=0.005, recipe=changed(exposure_fraction=fraction))
+    recipe = changed(exposure_fraction=fraction, drift=Drift(session_ramp=0.01))
+    plan = ms.plan_calibration(bench, 31.0, "dots:2", accuracy=0.005, recipe=recipe)
+    (warning,) = plan.warnings
+    assert warning.startswith("drift: ")
     found, whole = plan.recipe, plan.recipe.repeats > 1
     assert whole == (fraction < 0.8) and (found.exposure_fraction == fraction) == whole
     less = {"repeats": found.repeats - 1} if whole else {"exposure_fraction": 0.99 * found.exposure_fraction}

@@ -101,10 +101,10 @@ def test_saved_and_loaded_they_are_the_same(tmp_path: Path) -> None:
         assert shown._repr_html_().count("data:image/png;base64,") == 2
 
 
-def test_a_rank_counts_directions_above_three_deviations_of_the_noise() -> None:
+def test_a_rank_counts_directions_above_six_deviations_of_the_noise() -> None:
     """Of a factor of 50 rows whose two small singular values lie 2 % above and below the limit, where an error of a
-    tenth has the energy e^2 |Phi|^2 / 150 (50 + 3 sqrt(100)) in a direction. (Planted: the noise of all numbers.)"""
-    part = 0.1**2 / 150 * (50 + 3 * np.sqrt(100))
+    tenth has the energy e^2 |Phi|^2 / 150 (50 + 6 sqrt(100)) in a direction. (Planted: the noise of all numbers.)"""
+    part = 0.1**2 / 150 * (50 + 6 * np.sqrt(100))
     limit = np.sqrt(part / (1 - 2 * part))
     turned = np.linalg.qr(np.random.default_rng(1).standard_normal((50, 3)))[0]
     assert rank_above_noise(turned * [1.0, 1.02 * limit, 0.98 * limit], 0.1) == 2
