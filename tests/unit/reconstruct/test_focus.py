@@ -248,7 +248,7 @@ def test_light_of_a_lamp_does_not_move_depth(fine: Factors) -> None:
     [
         ((450.0, 350.0), "auto", "smaller one first"),
         ((350.0,), "map", "two numbers"),
-        ((350.0, 450.0), None, "focus auto or map"),
+        ((350.0, 450.0), None, "focus auto, map or volume"),
         ((1.0, 450.0), "auto", "where the mask is"),
         ((60.0, 450.0), "auto", "nearer to the calibrated 400 mm"),
     ],
