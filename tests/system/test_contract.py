@@ -135,7 +135,7 @@ def test_reconstruct(call: Call, lab: Any, tmp_path: Path) -> None:
         *("truth_error", "rank_sides", "condition_whole", "condition_sides"),
         *("misfit", "uncertainty", "uncertainty_budget", "focus_mm", "focus_error_mm", "depths"),
         *("uncertainty_extrapolated", "regularisation_bias_factor", "focus_range_mm", "focus_alternatives"),
-        *("objective", "relative_gap", "iterations", "white", "headline", "shape"),
+        *("objective", "relative_gap", "iterations", "white", "headline", "shape", "volume_depths_mm"),
         *("predicted", "predicted_seconds", "predicted_memory_bytes", "memory_bytes", "report"),
     }
     assert found["focus_mm"] is None and found["focus_error_mm"] is None
