@@ -118,6 +118,7 @@ def test_damaged_profiles_are_refused_in_one_line(small_scene: Callable[..., Pat
         "claims 19 x 1e": good.replace("1 19 37", "1 19 1e12"),
         "angles beyond": good.replace("\n0.00000 5.00000", "\n-1.00000 5.00000", 1),
         "do not grow": good.replace("10.00000", "1.00000", 1),
+        "angles that do not grow": good.replace("175.00000", "170.00000", 1),
         "negative candelas": good.replace("\n110.00000", "\n-110.00000"),
     }
     for words, content in wrong.items():
