@@ -19,6 +19,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from mitsim.core.errors import MitsimError
+from mitsim.core.job import Job
 from mitsim.report import plots
 from mitsim.studies.framework import campaign
 from mitsim.studies.framework.campaign import StudyResult, Where, merge, run_experiment, shard_of, study_folder
@@ -105,6 +106,10 @@ def test_every_point_is_measured_once_and_put_together(run: Run, tmp_path: Path)
     assert reported["status"] == "complete" and reported["kind"] == "toy" and reported["figures"] == ["squares.png"]
     page = (folder / "toy.html").read_text()
     assert "Two squared is four" in page and "data:image/svg+xml;base64," in page and "<script" not in page
+    # (Planted: no command in the page; none in the JSON.)
+    run_experiment(TOY, SCOPE, folder, Job(command="mitsim study toy"), Where(jobs=1))
+    assert "<code>mitsim study toy</code>" in (folder / "toy.html").read_text()
+    assert json.loads((folder / "toy.json").read_text())["command"] == "mitsim study toy"
 
 
 def test_what_is_there_is_not_measured_again(run: Run, tmp_path: Path, whole: Whole) -> None:
