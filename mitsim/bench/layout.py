@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from mitsim.bench.apparatus import Apparatus, Opened, check_depth
 from mitsim.core.arrays import FloatArray
-from mitsim.core.environment import keep_scenes
+from mitsim.core.environment import device_array, keep_scenes
 from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.devices.mask import Mask
 from mitsim.devices.patterns import PatternFamily
@@ -188,14 +188,14 @@ def _triangles_of_mesh(mesh: mi.Mesh, wanted: float) -> tuple[FloatArray, npt.ND
     at = dr.zeros(mi.SurfaceInteraction3f, len(corners))
     at.p, at.wi = mi.Point3f(*device_vectors(corners[:, :3])), mi.Vector3f(0, 0, 1)
     at.uv = mi.Point2f(corners[:, 3:5].T.astype(np.float32))
-    at.shape, at.prim_index = mi.ShapePtr(mesh), mi.UInt32(corners[:, 5].astype(np.uint32))
+    at.shape, at.prim_index = mi.ShapePtr(mesh), device_array(mi.UInt32, corners[:, 5])
     return corners[:, :3], triangles.reshape(-1, 3), _reflectance(mesh.bsdf(), at, len(corners))
 
 
 def _triangles_without_faces(shape: mi.Shape) -> tuple[FloatArray, npt.NDArray[np.int64], FloatArray]:
     """Return a shape on a grid of its surface parameters, or its bounding box where Mitsuba has none."""
     line = np.linspace(1e-6, 1 - 1e-6, _GRID + 1).astype(np.float32)  # The middle of a disk is undefined.
-    u, v = (mi.Float(axis.ravel()) for axis in np.meshgrid(line, line))
+    u, v = (device_array(mi.Float, axis) for axis in np.meshgrid(line, line))
     corner = (np.arange(_GRID)[:, None] * len(line) + np.arange(_GRID)).reshape(-1, 1)
     triangles = np.concatenate([corner + [0, 1, len(line)], corner + [1, len(line) + 1, len(line)]])
     try:
@@ -283,7 +283,7 @@ def _preview(scene: mi.Scene, world: FloatArray, place: FloatArray, angle: float
     light = np.nan_to_num(light.reshape(_PIXELS, _PIXELS, -1))
     side = _PIXELS * _EDGES
     column, row = np.meshgrid((np.arange(side) + 0.5) / side, (np.arange(side) + 0.5) / side)
-    places = mi.Point2f(*(mi.Float(axis.ravel().astype(np.float32)) for axis in (column, row)))
+    places = mi.Point2f(*(device_array(mi.Float, axis) for axis in (column, row)))
     ray, _ = sensor.sample_ray_differential(0.0, 0.5, places, mi.Point2f(0.5))
     met = scene.ray_intersect(ray)
     hit = host_values(met.is_valid(), side * side).astype(float)[:, None]

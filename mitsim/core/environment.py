@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 from mitsim.core.errors import ArgumentError, MitsimError, reason_of
 from mitsim.core.files import write_json
@@ -111,6 +112,24 @@ def compiled_arrays() -> tuple[ModuleType, ModuleType]:
         import drjit
         import drjit.llvm
     return drjit, drjit.llvm
+
+
+_VECTOR = 16
+"""Numbers that a kernel of Dr.Jit loads at once, at most."""
+
+
+def device_array(kind: Any, values: Any) -> Any:
+    """Return numbers ``values`` of numpy, in memory order, as a flat array of Dr.Jit's type ``kind``.
+
+    Dr.Jit 1.5.0 uses numpy's memory in place, and its kernels load whole vectors. The last one of ``kind(values)`` ends
+    beyond the array, which ends the process where no memory follows. Therefore such arrays get room for it.
+    """
+    import drjit
+    import numpy as np
+
+    flat = np.ascontiguousarray(values, drjit.type_v(kind).name.lower()).ravel()
+    spare = -len(flat) % _VECTOR
+    return kind(np.append(flat, np.zeros(spare, flat.dtype))[: len(flat)] if spare else flat)
 
 
 def check_variant(variant: str) -> None:

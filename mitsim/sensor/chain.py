@@ -21,7 +21,7 @@ import numpy.typing as npt
 import scipy
 
 from mitsim.core.arrays import FloatArray
-from mitsim.core.environment import compiled_arrays
+from mitsim.core.environment import compiled_arrays, device_array
 from mitsim.core.errors import MitsimError
 from mitsim.core.job import compiled_kernels
 from mitsim.core.seeds import stream
@@ -366,7 +366,7 @@ def _run(
             return [share(values)] * LANE
         if len(values) < LANE * quarter:
             values = np.pad(values, (0, LANE * quarter - len(values)), mode="edge")
-        return [types.Float64(part) for part in values.reshape(LANE, quarter)]
+        return [device_array(types.Float64, part) for part in values.reshape(LANE, quarter)]
 
     every = SimpleNamespace(**{
         name: tuple(map(share, value)) if isinstance(value, tuple) else share(value)

@@ -25,7 +25,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitsim.core.arrays import FloatArray
-from mitsim.core.environment import keep_scenes
+from mitsim.core.environment import device_array, keep_scenes
 from mitsim.core.errors import MitsimError
 from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.projector import Lines
@@ -297,7 +297,7 @@ class SensorPoints:
 
     def place(self, row: mi.UInt32, column: mi.UInt32, point: mi.Point2f) -> mi.Point3f:
         # For a single number Dr.Jit would compile another kernel.
-        positions = mi.Float(np.append(self.positions, 0).astype(np.float32))
+        positions = device_array(mi.Float, np.append(self.positions, 0))
         anchor = mi.Point3f(*x_y(dr.gather(mi.Float, positions, row), dr.gather(mi.Float, positions, column)), 0)
         return dr.select(dr.opaque(mi.Bool, self.spread), self.inside(point), anchor)
 
@@ -567,7 +567,7 @@ _LAMP_POINTS = 2**10
 @keep_scenes()
 def shines_in(scene: mi.Scene, camera: mi.Sensor, lamp: mi.Emitter) -> bool:
     edge = np.linspace(-1, 1, _SENSOR_POINTS) * camera.geometry.half_width
-    x, y = (mi.Float(axis.ravel()) for axis in np.meshgrid(edge, edge))
+    x, y = (device_array(mi.Float, axis) for axis in np.meshgrid(edge, edge))
     to_world, sensor = camera.world_transform(), dr.zeros(mi.SurfaceInteraction3f, _SENSOR_POINTS**2)
     sensor.p = to_world @ mi.Point3f(x, y, 0)
     _, rng = base.streams(0, dr.arange(mi.UInt32, _SENSOR_POINTS**2), mi.UInt32(0))

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsim.core.arrays import FloatArray
-from mitsim.core.environment import keep_scenes
+from mitsim.core.environment import device_array, keep_scenes
 from mitsim.devices.projector import Lines
 from mitsim.transport.connect import OpticalSetup, Reception, SensorPoints, landing, sample_wavelengths
 from mitsim.transport.integrator import PATHS_PER_LAUNCH, InFlight, Tracer
@@ -65,7 +65,7 @@ class DirectTracer(Tracer):
 
     def _sightings(self, flight: InFlight) -> tuple[Sightings, Anchor]:
         number, anchor, share = self._pair(flight)
-        pixel = dr.gather(mi.UInt32, mi.UInt32(self._pixels), number)
+        pixel = dr.gather(mi.UInt32, device_array(mi.UInt32, self._pixels), number)
         anchors = dr.opaque(mi.UInt32, self.points.anchors)
         row, column = anchor // anchors, anchor % anchors
         # Streams belong to pixels: every anchor is connected to the same points.
@@ -121,7 +121,7 @@ class FluxTracer:
         blocks, at_once = groups * len(pixels), max(1, self.paths_per_launch // samples)
         lines, projectors = self._setup.projector.lines, self._setup.projector.per_wavelength
         total = np.zeros((len(lines.shares) if lines and lines.several else 1, blocks))
-        numbers, starts = mi.UInt32(pixels), mi.UInt32(first)
+        numbers, starts = (device_array(mi.UInt32, each) for each in (pixels, first))
         # Opaque numbers keep the compiled kernel the same for all of them.
         each, count = dr.opaque(mi.UInt32, samples), dr.opaque(mi.UInt32, len(pixels))
         for start in range(0, blocks, at_once):
@@ -248,7 +248,7 @@ class AimedTracer(DirectTracer):
         is_near = index < near
         place = dr.select(is_near, index, near + one_of)
         share = dr.select(is_near, 1.0, dr.select(one_of < far, float(_SELDOM), 0.0))
-        pairs = mi.UInt32(np.concatenate([self._near, self.far]))
+        pairs = device_array(mi.UInt32, np.concatenate([self._near, self.far]))
         pair = dr.gather(mi.UInt32, pairs, place, place < near + far)
         count = dr.opaque(mi.UInt32, len(self._pixels))
         return pair % count, pair // count, mi.Float(share)
@@ -257,9 +257,9 @@ class AimedTracer(DirectTracer):
         self, number: mi.UInt32, row: mi.UInt32, column: mi.UInt32, jitter: mi.Point2f
     ) -> tuple[mi.Point2f, mi.Float]:
         def of(values: npt.NDArray[np.generic]) -> mi.Float:
-            return dr.gather(mi.Float, mi.Float(np.ascontiguousarray(values, dtype=np.float32)), number)
+            return dr.gather(mi.Float, device_array(mi.Float, values), number)
 
-        positions = mi.Float(self.points.positions.astype(np.float32))
+        positions = device_array(mi.Float, self.points.positions)
         at = [dr.gather(mi.Float, positions, index) for index in (row, column)]
         aimed = (of(self._known) > 0) & (jitter.x >= _EVEN)
         even = dr.select(of(self._known) > 0, mi.Float(_EVEN), 1)
@@ -281,7 +281,7 @@ class AimedTracer(DirectTracer):
         count = len(self._pixels)
         index = dr.arange(mi.UInt32, _AXES * count)
         number, sample = index % dr.opaque(mi.UInt32, count), index // dr.opaque(mi.UInt32, count)
-        pixel = dr.gather(mi.UInt32, mi.UInt32(self._pixels), number)
+        pixel = dr.gather(mi.UInt32, device_array(mi.UInt32, self._pixels), number)
         shared, rng = streams(_SEED, pixel, sample)
         jitter = sobol_point(sample, shared)
         wavelengths, _ = sample_wavelengths(self.setup.camera, rng, self.projector.lines)

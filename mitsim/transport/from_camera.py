@@ -22,6 +22,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitsim.core.colour_files import MOST_LINES
+from mitsim.core.environment import device_array
 from mitsim.devices.projector import SPECTRA_NM, Band, Response
 from mitsim.transport import integrator
 from mitsim.transport.connect import OpticalSetup, ProjectorConnector, SensorPoints, sample_wavelengths
@@ -308,7 +309,7 @@ class LampTracer(FromCameraTracer):
 
     def wavelengths(self, rng: mi.PCG32, sample: mi.UInt32, shared: mi.PCG32) -> tuple[mi.Color0f, Light]:
         place = sobol_point(shuffle(sample, shared), shared).x
-        counts = mi.Float(self._response.counts.astype(np.float32))
+        counts = device_array(mi.Float, self._response.counts)
         steps = len(self._response.counts) - 1
         step = (SPECTRA_NM[1] - SPECTRA_NM[0]) / steps
         wavelengths, weights = [], []

@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsim.core.arrays import FloatArray, mean_of_neighbours
-from mitsim.core.environment import keep_scenes
+from mitsim.core.environment import device_array, keep_scenes
 from mitsim.core.job import compiled_kernels
 from mitsim.scene.load import holds_hair
 from mitsim.transport.connect import OpticalSetup, SensorPoints, Way, sample_wavelengths
@@ -586,7 +586,7 @@ class AdaptiveSamples:
         unit = np.repeat(np.arange(len(repeats)), repeats)
         starts = np.cumsum(repeats) - repeats
         turn = np.arange(len(unit)) - starts[unit]
-        return cls(*(mi.UInt32(each.astype(np.uint32)) for each in (unit, turn, repeats[unit])))
+        return cls(*(device_array(mi.UInt32, each) for each in (unit, turn, repeats[unit])))
 
     def __len__(self) -> int:
         return int(dr.width(self.unit))

@@ -23,7 +23,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsim.core.arrays import FloatArray, Labels, mean_of_neighbours
-from mitsim.core.environment import keep_scenes
+from mitsim.core.environment import device_array, keep_scenes
 from mitsim.transport.connect import OpticalSetup, PinholeRays, Reception, landing, sample_wavelengths, wavelength_sets
 from mitsim.transport.direct import DirectTracer
 from mitsim.transport.from_camera import CameraPaths, CameraState, FromCameraTracer
@@ -112,8 +112,9 @@ class _Landed:
         code = np.where(scatters, base.host_values(_cube(si.p, side), count), _CUBES)
         order = np.argsort(code, kind="stable")
         first = np.searchsorted(code[order], np.arange(_CUBES + 1))
-        rays = _Turned(mi.Vector3f(si.p), way, mi.UInt32(found.mirror), *map(mi.Float, found.spectrum.T))
-        return cls(mi.UInt32(first), side, dr.gather(_Turned, rays, mi.UInt32(order)))
+        lights = [device_array(mi.Float, each) for each in found.spectrum.T]
+        rays = _Turned(mi.Vector3f(si.p), way, device_array(mi.UInt32, found.mirror), *lights)
+        return cls(device_array(mi.UInt32, first), side, dr.gather(_Turned, rays, device_array(mi.UInt32, order)))
 
     def light(self, si: Surface, rng: mi.PCG32, active: mi.Bool) -> tuple[Light, Light, mi.UInt32]:
         """Return the radiance that surfaces send on of the light in their cubes, one ray of each drawn for all."""
@@ -362,7 +363,7 @@ def sharp_light(setup: OpticalSetup, seed: int, samples: int) -> SharpLight:
     first = _trace_lobes(setup, least, every, seed, 0, -(-samples // _FEWER), _WIDER)
     if not len(first.widths):
         return SharpLight.none(pixels)
-    least = mi.Float(np.clip(_SHARP * first.sharp, _LEAST_SHARP, _SHARP).astype(np.float32))
+    least = device_array(mi.Float, np.clip(_SHARP * first.sharp, _LEAST_SHARP, _SHARP))
     if first.widths.min() >= _BROAD * setup.geometry.half_width:
         # Broad lobes are met by connections, which measure their light.
         met, others = (_Connections(setup, least, sharp).trace(seed, 0, count) for sharp in (True, False))
@@ -477,7 +478,7 @@ def _trace_lobes(
     by_pixel, moments = np.zeros((2, setup.projector.n**2))
     turned = dr.zeros(mi.Float, len(by_pixel))
     for sample, place in launches(len(pixels), first, samples):
-        pixel = dr.gather(mi.UInt32, mi.UInt32(pixels), place)
+        pixel = dr.gather(mi.UInt32, device_array(mi.UInt32, pixels), place)
         hits = meet(seed, sample, pixel)
         # Whole numbers, whose sums in any order are the same.
         dr.scatter_reduce(dr.ReduceOp.Add, turned, hits.turns, pixel, hits.turns > 0)

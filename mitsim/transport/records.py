@@ -21,6 +21,7 @@ import numpy.typing as npt
 from scipy import sparse
 
 from mitsim.core.arrays import FloatArray, Labels
+from mitsim.core.environment import device_array
 from mitsim.core.errors import MitsimError
 from mitsim.core.job import compiled_kernels
 from mitsim.optics.shadow import Directions
@@ -374,7 +375,7 @@ class DeviceAccumulator:
         self.bundle, self.rows, self.lines = bundle, int(labels.max()) + 1, lines
         self._width = bundle.size + bundle.anchors**2
         self._unit = 2.0 ** (math.floor(math.log2(one)) - _UNIT_BITS)
-        self._labels = mi.UInt32(labels.astype(np.uint32))
+        self._labels = device_array(mi.UInt32, labels)
         # The last entry counts refused light: negative, not finite or too bright.
         self._entries = self.rows * self._width + 1
         self.sums = dr.zeros(mi.UInt64, self._entries * lines)

@@ -21,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsim.core.arrays import FloatArray
-from mitsim.core.environment import keep_scenes
+from mitsim.core.environment import device_array, keep_scenes
 from mitsim.core.errors import MitsimError
 from mitsim.optics.frames import Beams
 from mitsim.optics.image_formation import IntArray
@@ -699,8 +699,8 @@ def _spots(shape: mi.Shape, rays: PinholeRays, cell: float) -> Spots:
     if shape.is_mesh() and shape.class_name() != "Rectangle":
         count = shape.face_count()
         chosen = np.unique(np.linspace(0, count - 1, min(count, _MOST_SPOTS // 4)).astype(np.uint32))
-        corners = np.array(shape.face_indices(mi.UInt32(chosen))).T
-        places = np.array(shape.vertex_position(mi.UInt32(corners.ravel()))).T.astype(np.float64).reshape(-1, 3, 3)
+        corners = np.array(shape.face_indices(device_array(mi.UInt32, chosen))).T
+        places = np.array(shape.vertex_position(device_array(mi.UInt32, corners)), dtype=np.float64).T.reshape(-1, 3, 3)
         edges = places[:, [1, 2, 0]] - places
         lengths = np.linalg.norm(edges, axis=2)
         longest = lengths.max(axis=1)

@@ -16,6 +16,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from mitsim.core.environment import device_array
 from mitsim.transport.plugins.base import Surface, generator
 from mitsim.transport.plugins.materials import is_glass
 
@@ -212,11 +213,11 @@ def flat_panes(scene: mi.Scene) -> list[mi.ShapePtr]:
             panes.append(mi.ShapePtr(shape))
         if not glass or not shape.is_mesh() or shape.face_count() > _MOST_FACES:
             continue
-        faces = np.arange(shape.face_count(), dtype=np.uint32)
-        normal = np.array(shape.face_normal(mi.UInt32(faces)), dtype=np.float64).T
+        faces = dr.arange(mi.UInt32, shape.face_count())
+        normal = np.array(shape.face_normal(faces), dtype=np.float64).T
         if shape.has_vertex_normals() and not shape.has_face_normals():
-            corners = np.array(shape.face_indices(mi.UInt32(faces))).T
-            shading = np.array(shape.vertex_normal(mi.UInt32(corners.ravel())), dtype=np.float64).T
+            corners = np.array(shape.face_indices(faces)).T
+            shading = np.array(shape.vertex_normal(device_array(mi.UInt32, corners)), dtype=np.float64).T
             if np.abs(np.cross(shading, np.repeat(normal, 3, axis=0))).max() > _FLAT:
                 continue
         cosine = np.abs(normal @ normal.T)

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from mitsim.core.arrays import FloatArray
+from mitsim.core.environment import device_array
 
 Surface: TypeAlias = "mi.SurfaceInteraction3f"
 Light: TypeAlias = "mi.UnpolarizedSpectrum"
@@ -45,7 +46,7 @@ def device_vectors(vectors: FloatArray) -> tuple[mi.Float, mi.Float, mi.Float]:
     Dr.Jit compiles kernels that read arrays in place anew for each alignment, which differs for nearly every k (50 ms
     each).
     """
-    flat = mi.Float(np.ascontiguousarray(vectors, dtype=np.float32).ravel())
+    flat = device_array(mi.Float, vectors)
     first = 3 * dr.arange(mi.UInt32, len(vectors))
     x, y, z = (dr.gather(mi.Float, flat, first + part) for part in range(3))
     return x, y, z

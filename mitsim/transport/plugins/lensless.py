@@ -65,6 +65,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitsim.core.configuration import validate
+from mitsim.core.environment import device_array
 from mitsim.core.errors import MitsimError
 from mitsim.devices.camera import CameraGeometry
 from mitsim.devices.mask import BoolArray, Flaws, Plate
@@ -117,13 +118,13 @@ def plugin_class() -> type:
             self._whole = isinstance(mask, Plate) and mask.grids is None
             self._lines, self._flaws = None, Flaws()
             if isinstance(mask, Plate):
-                self._values, self._flaws = mi.Float(mask.values.astype(np.float32).ravel()), mask.flaws
+                self._values, self._flaws = device_array(mi.Float, mask.values), mask.flaws
                 if not mask.plain:
                     self._features, self._cover = len(mask.values), mask.cover
-                    self._lines = mi.Float(mask.lines.astype(np.float32))
+                    self._lines = device_array(mi.Float, mask.lines)
                 return
             for weight, rows, columns in mask.terms:
-                self._terms.append((weight, *(mi.Float(each.astype(np.float32)) for each in (rows, columns))))
+                self._terms.append((weight, *(device_array(mi.Float, each) for each in (rows, columns))))
 
         def stratify(self, points: tuple[int, int] | None) -> None:
             """Draw u and t of each pixel from Sobol points scrambled by (seed, paths a pixel); None: at random."""
@@ -248,8 +249,8 @@ class OpenAxis:
         self._size = len(bits)
         # Once more at the end, and a place that is not there after the last one: nothing is open beyond the mask.
         before = np.cumsum(np.concatenate([[0], bits, [0]]))
-        self._before = mi.UInt32(before.astype(np.uint32))
-        self._places = mi.UInt32(np.append(np.flatnonzero(bits), len(bits)).astype(np.uint32))
+        self._before = device_array(mi.UInt32, before)
+        self._places = device_array(mi.UInt32, np.append(np.flatnonzero(bits), len(bits)))
 
     def open_within(self, low: mi.Float, width: float) -> tuple[mi.Float, Callable[[mi.Float], mi.Float]]:
         """Return the open length of a part of the axis, and the function that makes a random number an open place."""

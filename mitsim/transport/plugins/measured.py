@@ -28,6 +28,7 @@ import mitsuba as mi
 import numpy as np
 
 from mitsim.core.configuration import read_toml, shipped_path
+from mitsim.core.environment import device_array
 from mitsim.core.errors import MitsimError
 from mitsim.scene.headers import read_measured
 from mitsim.transport.plugins.base import LIGHT, Draw, Surface, Value, adjoint, bsdf_class
@@ -134,8 +135,8 @@ def measured_class() -> type:
         def _largest_part(self) -> float:
             """Return the largest reflected part over angles of incidence, by samples on an even grid."""
             even = (np.arange(_DRAWS) + 0.5) / _DRAWS
-            grid = [each.ravel().astype(np.float32) for each in np.meshgrid(np.radians(_ANGLES), even, even)]
-            si, (angle, *s2) = dr.zeros(mi.SurfaceInteraction3f, grid[0].size), map(mi.Float, grid)
+            angle, *s2 = (device_array(mi.Float, each) for each in np.meshgrid(np.radians(_ANGLES), even, even))
+            si = dr.zeros(mi.SurfaceInteraction3f, dr.width(angle))
             if mi.is_spectral:
                 si.wavelengths = mi.Spectrum(np.linspace(400, 700, 4).tolist())
             si.wi = mi.Vector3f(-dr.sin(angle), 0, dr.cos(angle))

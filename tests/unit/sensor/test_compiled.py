@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import ctypes
 import math
+import mmap
+import sys
 from typing import Any
 
 import numpy as np
+import pytest
 from scipy import stats
 
 from mitsim.core.parallel import in_threads
@@ -67,6 +71,21 @@ def test_threads_draw_what_one_draws() -> None:
     names = [f"frame {k}" for k in range(12)]
     together = in_threads(lambda name: deviates(name, count=1000)[0], names)
     assert np.array_equal(together, deviates(*names, count=1000))
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="protects a page of memory by Linux's calls")
+def test_kernels_read_no_memory_past_an_array() -> None:
+    """An array that ends where memory ends. (Planted: Dr.Jit given numpy's own memory; the process died.)"""
+    system, page, count = ctypes.CDLL(None), mmap.PAGESIZE, 1004
+    room = -(-8 * count // page) * page
+    system.mmap.restype, size = ctypes.c_void_p, ctypes.c_size_t
+    start = system.mmap(
+        None, size(room + page), mmap.PROT_READ | mmap.PROT_WRITE, mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS, -1, size(0)
+    )
+    assert system.mprotect(ctypes.c_void_p(start + room), size(page), 0) == 0
+    light = np.frombuffer((ctypes.c_double * count).from_address(start + room - 8 * count))
+    drawn = by_pixel(lambda _, light, z: light + z, {}, (light,), (stream(SEED, "one"),))
+    assert np.array_equal(drawn, deviates("one", count=count)[0])
 
 
 def test_numbers_of_a_camera_are_not_kept() -> None:

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from mitsim.core.environment import device_array
 from mitsim.core.errors import MitsimError
 from mitsim.transport.plugins.materials import GlassModel, is_glass, tune
 
@@ -327,7 +328,7 @@ def test_a_face_does_what_plain_glass_of_that_index_does() -> None:
     directions = random.normal(size=(3, LANES))
     si = dr.zeros(mi.SurfaceInteraction3f, LANES)
     si.wi = mi.Vector3f((directions / np.linalg.norm(directions, axis=0)).astype(np.float32))
-    number, point = mi.Float(random.random(LANES).astype(np.float32)), mi.Point2f(0.5)
+    number, point = device_array(mi.Float, random.random(LANES)), mi.Point2f(0.5)
     kinds = 0xFFFFFFFF, int(mi.BSDFFlags.DeltaReflection), int(mi.BSDFFlags.DeltaTransmission), int(mi.BSDFFlags.Glossy)
     for mode in (mi.TransportMode.Radiance, mi.TransportMode.Importance):
         for kind in kinds:

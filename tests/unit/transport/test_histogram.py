@@ -2,12 +2,14 @@
 
 from dataclasses import replace
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from mitsim.core.environment import device_array
 from mitsim.transport.records import (
     AMBIENT,
     DIRECT,
@@ -165,9 +167,8 @@ def test_small_light_beside_great_light_is_counted() -> None:
     light = np.ones(4097, np.float32)
     light[0] = 2.0**24
     assert np.add.accumulate(light)[-1] == 2.0**24, "float32 loses all of it"
-    zeros = [mi.Float(np.zeros(4097, np.float32)) for _ in range(2)]
-    depth = mi.Float(np.full(4097, 1 / 400, np.float32))
-    seen = Sightings(mi.Float(light), mi.UInt32(np.zeros(4097, np.uint32)), *zeros, depth)
+    zeros, depth = [dr.zeros(mi.Float, 4097) for _ in range(2)], dr.full(mi.Float, 1 / 400, 4097)
+    seen = Sightings(device_array(mi.Float, light), dr.zeros(mi.UInt32, 4097), *zeros, depth)
     fetched, alone = PathSamples.fetch(seen, DIRECT), bundle(anchors=1)
     assert fetched.value.dtype == np.float64 and fetched.value.sum() == 2.0**24 + 4096
     assert alone.accumulate(fetched, LABELS).sum() == 2.0**24 + 4096

@@ -15,6 +15,7 @@ import pytest
 from scipy.optimize import fsolve
 
 from mitsim.api.bench import Bench, open_bench
+from mitsim.core.environment import device_array
 from mitsim.core.errors import MitsimError
 from mitsim.scene.load import LoadedScene
 from mitsim.transport.transmission import Passage, flat_panes, refracted_way
@@ -225,7 +226,7 @@ def test_a_ray_gets_on_beside_a_long_thin_triangle() -> None:
     wire = mi.Mesh("wire", vertex_count=3, face_count=1)
     parameters = mi.traverse(wire)
     corners = np.array([[94.29, -22.52, 369.56], [-37.09, 14.19, 353.72], [-37.09, 14.197, 353.72]])
-    parameters["vertex_positions"] = mi.Float(corners.ravel().astype(np.float32))
+    parameters["vertex_positions"] = device_array(mi.Float, corners)
     parameters["faces"] = mi.UInt32([0, 1, 2])
     parameters.update()
     passage = Passage(mi.load_dict({"type": "scene", "wire": wire}))
