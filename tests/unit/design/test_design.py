@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import mitsim as ms
+from mitsim.calibrate.board_session import Session
 from mitsim.core.errors import MitsimError
 from mitsim.core.files import read_json, write_json
 from mitsim.core.images import read_reflectance, write_numbers
@@ -30,6 +31,7 @@ from mitsim.design.masks import (
 )
 from mitsim.design.predict import Stand
 from mitsim.design.search import Found, Search
+from mitsim.devices.session import load_recipe
 from mitsim.optics.terms import ModelledCamera
 
 GOAL: dict[str, Any] = {
@@ -173,7 +175,7 @@ def test_the_drawn_mask_casts_the_shadow_of_the_code(tmp_path: Path) -> None:
     """An asymmetric code, so that a mirrored or shifted drawing is seen; the waves' grid errs by 5e-3.
 
     The predictor, which is another program for the same errors, agrees by cause within 6 % behind lamps, and does not
-    find the full well exceeded. (Planted: weights, profiles and shots of ambient light, groups of pixels.)
+    find the full well exceeded. (Planted: weights, profiles, axes and shots of ambient light, groups of pixels.)
     """
     stand = stand_of(ms.open_bench("lamp_bench", camera="small"), 0)
     (objective,) = objectives(stand, Goal(**GOAL), CHOICE)
@@ -187,6 +189,11 @@ def test_the_drawn_mask_casts_the_shadow_of_the_code(tmp_path: Path) -> None:
     found = side(code).values.T
     scale = float(np.vdot(found, left) / np.vdot(found, found))
     assert np.linalg.norm(scale * found - left) < 1e-2 * np.linalg.norm(left)
+    lamps = Stand.of(Session(bench, load_recipe(), 0)).ambient
+    assert lamps is not None
+    shadow = np.outer(*(each(code).ambient for each in objective.sides))  # with exchanged axes 0.1 off
+    scale = float(np.vdot(shadow, lamps) / np.vdot(shadow, shadow))
+    assert np.linalg.norm(scale * shadow - lamps) < 0.04 * np.linalg.norm(lamps)
     predicted = bench.predict("dots:3", exposure=objective.frame_s((code, code)))
     parts = objective((code, code), predicted.errors.lam / objective.light.gain**2).parts
     causes = {**predicted.errors.causes}
