@@ -488,6 +488,16 @@ def seen_light(bench: Apparatus) -> tuple[int, tuple[float, float] | None]:
     return len(np.unique(light.pixel[light.value > 0])), depths
 
 
+def seen_depths(bench: Apparatus) -> FloatArray:
+    """Return the mean depth (n, n) [mm] of each projector pixel's light that the sensor's centre sees, nan if none."""
+    light = DirectTracer(bench.setup, 1).trace(0, 0, 16)
+    seen, count = light.value > 0, bench.n**2
+    hits = np.bincount(light.pixel[seen], minlength=count)
+    total = np.bincount(light.pixel[seen], 1 / light.inverse_depth[seen], count)
+    found: FloatArray = np.where(hits > 0, total / np.maximum(hits, 1), np.nan)
+    return found.reshape(bench.n, bench.n)
+
+
 # ---- The mask ----
 
 

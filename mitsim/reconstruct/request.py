@@ -77,7 +77,7 @@ class ImageRequest(Options):
     depth_range: Two = option(
         None,
         "with focus auto, map or volume: nearest and farthest depth to try [mm]; by default 1/z differs by at most a "
-        "quarter from that of the calibration",
+        "quarter from that of the calibration, and with volume its parallax by at most half a period of the dots",
         metavar="A:B",
         read=_two("depth_range", "give the nearest and the farthest depth [mm], such as 350:450"),
     )

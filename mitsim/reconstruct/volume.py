@@ -24,10 +24,18 @@ from typing import Literal
 import numpy as np
 
 from mitsim.core.arrays import FloatArray
-from mitsim.core.errors import MitsimError
+from mitsim.core.errors import ArgumentError, MitsimError
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.runs import Capture
-from mitsim.reconstruct.depth import CommonBasis, DepthMap, are_dots, parallax_of, period_of_dots, shifts_searched
+from mitsim.reconstruct.depth import (
+    CommonBasis,
+    DepthMap,
+    are_dots,
+    best_depth,
+    parallax_of,
+    period_of_dots,
+    shifts_searched,
+)
 from mitsim.reconstruct.descent import Array, minimise
 from mitsim.reconstruct.factors import Factors
 from mitsim.reconstruct.misfit import GROSS
@@ -40,7 +48,11 @@ _FLOOR = 0.1
 _WEIGHT, _RIDGE = 1.2, 1e-3
 """TV's weight in units of the gradient's noise, and lambda over the mean square of a pixel's light."""
 _ITERATIONS, _TOLERANCE = 300, 0.02
-_MOST_PLANES = 256
+_MOST_PLANES, _END = 256, 0.02
+_LEAST_PERIOD, _WITHIN = 4, 0.49
+_MISFIT = 0.04
+"""Part of the frames within the factors' space: cameras as calibrated leave up to 0.036, because surfaces lie between
+the depths. A sensor that moved by a pixel leaves 0.06, and a mask 50 um farther 0.033."""
 
 
 class Planes:
@@ -122,6 +134,26 @@ class Volume(DepthMap):
         return f"focus: a volume of {len(self.slices)} depths from {ends}"
 
 
+def _check_default(shots: Capture, factors: Factors, period: float, pixel: float) -> None:
+    if period < _LEAST_PERIOD * pixel:
+        raise ArgumentError(
+            "depth_range",
+            f"none: the dots repeat after {period / pixel:.0f} projector pixels of parallax; use dots of a longer "
+            "period along the baseline, such as dots:7x16, or give the nearest and the farthest depth",
+        )
+    middle, found = 1 / parallax_of(factors).depth_mm, best_depth(shots, factors).mm
+    if abs(1 / found - middle) > period / 2:
+        here, there = (
+            f"{1 / (about + _WITHIN * period):.4g}:{1 / (about - _WITHIN * period):.4g}"
+            for about in (middle, 1 / found)
+        )
+        raise ArgumentError(
+            "depth_range",
+            f"none: the range is then {here} mm, a period of the dots about the calibrated depth, but the scene seems "
+            f"to be at {found:.4g} mm; give a range, such as {there}",
+        )
+
+
 @single_threaded_blas()
 def solve_volume(
     shots: Capture, factors: Factors, request: ImageRequest, lam: float | Literal["auto"] = "auto"
@@ -133,8 +165,14 @@ def solve_volume(
     if not all(map(are_dots, shots.patterns)):
         raise MitsimError("focus volume: needs shifting dots, such as dots:7x16, whose displacement depends on depth")
     ends, inverse = shifts_searched(factors, request.depth_range), 1 / parallax_of(factors).depth_mm
+    period = period_of_dots(factors, shots.patterns)
+    if request.depth_range is None:
+        # Frames hardly distinguish depths that are a period of the dots apart.
+        ends = max(ends[0], -period / 2), min(ends[1], period / 2)
     basis = CommonBasis(shots, factors, ends)
-    period, pixel = period_of_dots(factors, shots.patterns), 1 / max(side.reach for side in basis.sides)
+    pixel = 1 / max(side.reach for side in basis.sides)
+    if request.depth_range is None:
+        _check_default(shots, factors, period, pixel)
     count = math.ceil((ends[1] - ends[0]) / pixel) + 1
     if count > _MOST_PLANES:
         raise MitsimError(f"focus volume: the range has {count} depths, at most {_MOST_PLANES} are solved; narrow it")
@@ -151,20 +189,32 @@ def solve_volume(
     known = (_WEIGHT * noise if method == TV else _RIDGE) if lam == "auto" else check_lambda(lam)
     prior = Prior(known, 0.0, bounds or Prior.bounds) if method == TV else Prior(0.0, known, bounds or Prior.bounds)
     found = minimise(planes, frames, prior, request.iterations or _ITERATIONS, _TOLERANCE)
-    left_over = basis.outside + planes.energy(planes.image_of(found.image) - frames)
-    noise_energy = float(basis.noise.variance.mean()) * basis.data
-    unexplained = math.sqrt(max(left_over - noise_energy, 0.0) / basis.energy) if basis.energy else 0.0
-    if unexplained > GROSS and not doubt:
+    inside, variance = planes.energy(planes.image_of(found.image) - frames), float(basis.noise.variance.mean())
+    left_over = basis.outside + inside
+    parts = (left_over - variance * basis.data, GROSS), (inside - variance * basis.stack.size, _MISFIT)
+    unexplained = [(math.sqrt(max(part, 0.0) / (basis.energy or 1.0)), most) for part, most in parts]
+    slices = found.image.astype(np.float64)
+    depths_mm, weights = 1 / (inverse + shifts), np.maximum(slices, 0.0)
+    light = slices.sum(axis=(1, 2))
+    # Without bounds, noise gives slices light of either sign.
+    least = max(_END * float(light.sum()), -float(light.min()))
+    at_end = any(light[end] > max(light[inner], least) for end, inner in ((0, 1), (-1, -2))) if count > 1 else False
+    if at_end and not doubt:
         doubt = (
-            f"Misfit: {unexplained:.0%} of the frames is left unexplained; check that the camera is the "
+            f"End of range: light piles up at an end of {depths_mm.min():.4g} to {depths_mm.max():.4g} mm, so that the "
+            "scene may lie outside; give a wider range with --depth-range NEAR:FAR or depth_range, and dots of a "
+            "period as long."
+        )
+    if any(part > most for part, most in unexplained) and not doubt:
+        doubt = (
+            f"Misfit: {unexplained[0][0]:.0%} of the frames is left unexplained; check that the camera is the "
             "calibrated one, and give the range of the scene's depths."
         )
     lowered = f"the last half of {found.iterations} iterations lowered the objective by {found.fall:.1%}"
     status = Status(Verdict.SOLVED, f"Solved: a reflectance for each projector pixel at {count} depths; {lowered}")
     if found.fall > _TOLERANCE:
         status = Status(Verdict.NOT_CONVERGED, f"Not converged: {lowered} or more", "allow more iterations")
-    slices = found.image.astype(np.float64)
-    image, depths_mm, weights = slices.sum(axis=0), 1 / (inverse + shifts), np.maximum(slices, 0.0)
+    image = slices.sum(axis=0)
     total = weights.sum(axis=0)
     dark = total <= np.finfo(np.float32).eps * float(total.max())
     share = weights / np.where(dark, 1.0, total)

@@ -18,11 +18,11 @@ PAPER = (
     "convolutional", "depth", "waterfall",
 )  # fmt: skip
 """Studies that `mitsim study all` puts on one page, in this order."""
-EXPERIMENTS = (*PAPER, "accuracy", "calibration", "colour", "design", "drift", "learned", "sweep", "twin")
+EXPERIMENTS = (*PAPER, "accuracy", "calibration", "colour", "design", "drift", "learned", "sweep", "twin", "volume")
 """Studies of many points, whose modules have a ``STUDY``. The page of all lacks ``learned``, because it takes hours and
 needs torch."""
 SHARED = {
-    **dict.fromkeys(("distance", "binning", "resolution", "depth"), "camera_studies"),
+    **dict.fromkeys(("distance", "binning", "resolution", "depth", "volume"), "camera_studies"),
     **dict.fromkeys(("patterns", "exposure", "ambient", "reflectivity"), "light_studies"),
     **dict.fromkeys(("multishot", "convolutional"), "other_cameras"),
 }

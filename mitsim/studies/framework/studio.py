@@ -24,6 +24,7 @@ from mitsim.core.errors import MitsimError
 from mitsim.devices.patterns import PatternFamily
 from mitsim.light.plan import Plan
 from mitsim.metrics import Quality
+from mitsim.reconstruct.depth import DepthMap
 from mitsim.reconstruct.factors import Factors, load_calibration
 from mitsim.reconstruct.misfit import Misfit
 from mitsim.reconstruct.reconstruct import reconstruct
@@ -49,6 +50,7 @@ class Image:
     flags: Mapping[str, Value]
     trust: Mapping[str, float | None] = field(default_factory=dict)
     seconds: float | None = None
+    depths_mm: FloatArray | None = None
 
     @classmethod
     def of(
@@ -171,8 +173,9 @@ class Studio:
         patterns: str,
         seed: int = 0,
         exposure: str = EQUAL_PEAK,
-        focus: Literal["auto", "map"] | None = None,
+        focus: Literal["auto", "map", "volume"] | None = None,
         method: str = TIKHONOV,
+        depth_range: tuple[float, float] | None = None,
         lam: float | Literal["auto"] = "auto",
     ) -> Image:
         """Return the image of a scene; a rendered one is exposed and reconstructed as a user's own frames are.
@@ -185,7 +188,9 @@ class Studio:
             return Image.of(frames, frames.seconds(exposure))
         exposure_s = "auto" if exposure == EQUAL_PEAK else frames.seconds(exposure)
         shots = expose(frames.lit.light, patterns, seed=seed, exposure=exposure_s)
-        found = reconstruct(shots, self.factors(setup, seed), lam=lam, focus=focus, method=method)
+        found = reconstruct(
+            shots, self.factors(setup, seed), lam=lam, focus=focus, method=method, depth_range=depth_range
+        )
         misfit, uncertainty = found.misfit, found.uncertainty
         trust = {
             "misfit": misfit.unexplained if misfit else None,
@@ -194,9 +199,8 @@ class Studio:
         }
         count, quality = len(frames.family.shots), frames.lit.quality(found.image)
         flags = flags_of(found.status, misfit=misfit)
-        return Image(
-            found.image, quality, found.lam, count, shots.exposure_s, flags, trust, sum(found.seconds.values())
-        )
+        depths, seconds = found.focus.mm if isinstance(found.focus, DepthMap) else None, sum(found.seconds.values())
+        return Image(found.image, quality, found.lam, count, shots.exposure_s, flags, trust, seconds, depths)
 
     def once(self, kind: str, most: int, key: Hashable, make: Callable[[], Kept]) -> Kept:
         """Return what ``make`` returned for the ``key``; the ``most`` last used of a ``kind`` are kept."""

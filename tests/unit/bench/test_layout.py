@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose
 
 from mitsim.api.bench import open_bench
 from mitsim.bench import layout as module
-from mitsim.bench.layout import Layout, layout_of, previews
+from mitsim.bench.layout import Layout, layout_of, previews, seen_depths
 
 pytestmark = pytest.mark.usefixtures("variant")
 POSE = "0 0 1 500 0 1 0 -20 -1 0 0 30 0 0 0 1"
@@ -38,8 +38,12 @@ def layout(path: Path) -> Layout:
 def test_devices_and_light_stand_where_the_scene_says(small_scene: Callable[..., Path], pose: str) -> None:
     """A projector 60 mm beside the camera lights 120 mm at 400 mm by 16 pixels, in the camera's frame wherever that is;
     a card at 350 mm hides some of the sheet. Between both depths a pixel's light moves by 60 (1/350 - 1/400) in
-    tangents, of which a pixel has 120 / 16 / 400. (Planted: the camera's turn left out.)"""
-    found = layout(small_scene(pose=pose, extra=NEAR.format(pose=pose)))
+    tangents, of which a pixel has 120 / 16 / 400. (Planted: the camera's turn left out; depths by pixel upside down,
+    and of one ray.)"""
+    path = small_scene(pose=pose, extra=NEAR.format(pose=pose))
+    found, depths = layout(path), seen_depths(open_bench(path))
+    assert_allclose(depths[[3, 7, 12], [7, 5, 7]], [350, 350, 400], rtol=1e-5)
+    assert 351 < depths[7, 10] < 399
     assert_allclose(found.projector, [60, 0, 0], atol=1e-3)
     assert_allclose(np.ptp(found.window, axis=0), [120, 120, 0], atol=2e-3)
     assert_allclose(found.window[0], [60, 60, 400], atol=2e-3)
