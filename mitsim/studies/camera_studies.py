@@ -300,8 +300,8 @@ SEVERAL = Study(
     about="Frames are exposed at equal peak and solved with factors of a session at 400 mm: one depth of each pixel by "
     "--focus map, volumes by --focus volume --method tv. Volumes under dots have the default range, and those under "
     "uniform light the scene's. The true depth is the mean over 16 rays of a pixel, and pixels of reflectance above "
-    "0.05 count. After +-: one standard error over three seeds of session and noise. A quick study has the camera small "
-    "where none is named. Your own scene is lit by dots:7x16.",
+    "0.05 count. After +-: one standard error over three seeds of session and noise. A quick study has the camera "
+    "small where none is named. Your own scene is lit by dots:7x16.",
     heads=("", "", "Measured"),
 )  # fmt: skip
 
