@@ -36,7 +36,7 @@ from mitsim.devices.sensor import load_sensor
 from mitsim.exchange.capture_list import FrameFacts
 from mitsim.exchange.formats import OF_FOLDERS, READERS, Exported, Pictures
 from mitsim.learn.requests import METHODS, Schedule, Training
-from mitsim.reconstruct.request import MODEL, ImageRequest, check_joint, check_parallax, holds_image
+from mitsim.reconstruct.request import LIST, MODEL, ImageRequest, check_joint, check_parallax, holds_image
 from mitsim.verbs import CompareOptions, load_network
 from mitsim.verbs import train as train_model
 
@@ -60,8 +60,8 @@ class Reconstructing(ImageRequest, Pictured):
     psf: Path | None = option(
         None,
         "measured point spread function, a picture, in place of a calibration; for coloured runs with one channel, or "
-        "one for each line",
-        metavar="FILE",
+        "one for each line; or a list of pictures of several depths or places",
+        metavar="FILE|LIST.toml",
     )
     reduce: int = option(1, "only with --psf: average blocks of K x K pixels", min=1, metavar="K")
     chart: str | None = option(
@@ -79,6 +79,8 @@ class Reconstructing(ImageRequest, Pictured):
             if lines.filters:
                 raise MitsimError(f"--psf {self.psf}: {run} has the frames of a mosaic in one; use a calibration")
             self.check_point_spread(self.reduce)
+            if lines.colours and self.psf.suffix.lower() == LIST:
+                raise MitsimError(f"--psf {self.psf}: {run} is coloured, and lists are of one line; give a picture")
             if not self.psf.is_file():
                 raise MitsimError(f"--psf {self.psf}: is no file; give a picture of the light of a scene point")
             return

@@ -533,9 +533,10 @@ def size_of(values: npt.NDArray[np.generic] | Sequence[int]) -> str:
 
 def reduce_frame(frame: Numbers, reduce: int) -> Numbers:
     """Return the means of whole blocks of ``reduce`` x ``reduce`` pixels, in the type of ``frame``."""
-    rows, columns = (size // reduce for size in frame.shape)
-    blocks = frame[: rows * reduce, : columns * reduce].reshape(rows, reduce, columns, reduce)
-    return np.asarray(blocks.mean(axis=(1, 3)), frame.dtype)
+    rows, columns = (size // reduce for size in frame.shape[-2:])
+    whole = frame[..., : rows * reduce, : columns * reduce]
+    blocks = whole.reshape(*frame.shape[:-2], rows, reduce, columns, reduce)
+    return np.asarray(blocks.mean(axis=(-3, -1)), frame.dtype)
 
 
 def write_numbers(path: Path, values: Numbers) -> None:

@@ -145,8 +145,7 @@ def _start(light: Any, frames: Array, prior: Prior) -> _State:
     if smaller:
         # Half as many pixels a side: TV of the same scene is a half, squares are a quarter.
         half = replace(prior, weight=prior.weight / 2)
-        less = np.stack([reduce_frame(each, 2) for each in frames])
-        found = _descend(_start(smaller, less, half), _COARSE_STEPS, 0.0)[0]
+        found = _descend(_start(smaller, reduce_frame(frames, 2), half), _COARSE_STEPS, 0.0)[0]
         image = light.double(found.image)
     else:
         image = np.zeros(light.scene, light.precision)

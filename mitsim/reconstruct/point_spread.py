@@ -56,10 +56,12 @@ from mitsim.core.runs import Capture
 from mitsim.devices.camera import load_psf
 from mitsim.devices.patterns import PatternFamily
 from mitsim.reconstruct.descent import Array, minimise
+from mitsim.reconstruct.light_list import Lights, blend, load_lights
 from mitsim.reconstruct.reconstruct import POINT_SPREAD, PointSpreadFit, Reconstruction
-from mitsim.reconstruct.request import TIKHONOV, TV, Bounds, ImageRequest
+from mitsim.reconstruct.request import LIST, TIKHONOV, TV, Bounds, ImageRequest
 from mitsim.reconstruct.solver import Solution, Status, Verdict, check_lambda
 from mitsim.reconstruct.solvers import Prior
+from mitsim.reconstruct.volume import Volume, mean_depth
 
 Operator = Callable[[FloatArray], FloatArray]
 
@@ -71,8 +73,10 @@ _LEAST_SIDE = 32
 
 @dataclass(eq=False)
 class ShiftedLight:
-    """Camera whose scene points all cast one pattern of light ``psf`` (k, k').
+    """Camera whose scene points all cast one pattern of light ``psf`` (k, k'), or one of several (D, k, k').
 
+    Several are those of a scene (D, n, n') of D depths or, with ``places`` (D, 2) [pixels, from the middle of the
+    frame], of a scene (n, n') whose points cast their :func:`blend`.
     ``patterns`` are P_L (n, K) and P_R (n', K'), or None for uniform light. ``seen`` (m, m') is 0 for held-out pixels.
     ``scene`` and ``whole`` are the sizes of the scene and of its light, whose first pixel is ``origin`` on the sensor;
     ``window`` is the part of the scene that is the image. Light that wraps round ``grid`` lands beside the sensor.
@@ -83,17 +87,18 @@ class ShiftedLight:
     patterns: tuple[FloatArray, FloatArray] | None = None
     precision: Any = np.float64
     seen: Array | None = None
-    scene: tuple[int, int] = field(init=False)
+    places: FloatArray | None = None
+    scene: tuple[int, ...] = field(init=False)
     whole: tuple[int, int] = field(init=False)
     origin: tuple[int, int] = field(init=False)
-    window: tuple[slice, slice] = field(init=False)
+    window: tuple[slice, ...] = field(init=False)
     count: int = field(init=False)
     grid: tuple[int, int] = field(init=False)
 
     def __post_init__(self) -> None:
-        if self.psf.ndim != 2 or not np.isfinite(self.psf).all() or not self.psf.any():
+        if self.psf.ndim not in (2, 3) or not np.isfinite(self.psf).all() or not self.psf.any(axis=(-2, -1)).all():
             raise MitsimError(f"point spread function of shape {self.psf.shape}: give finite rows x columns, not all 0")
-        (rows, columns), (m, n), self.count = self.psf.shape, self.sensor, 1
+        (rows, columns), (m, n), self.count = self.psf.shape[-2:], self.sensor, 1
         self.scene, self.window = (m + rows - 1, n + columns - 1), (slice(None), slice(None))
         if self.patterns is None:
             up, before = (rows - 1) // 2, (columns - 1) // 2
@@ -104,7 +109,8 @@ class ShiftedLight:
         self.whole = self.scene[0] + rows - 1, self.scene[1] + columns - 1
         self.origin = (self.whole[0] - m) // 2, (self.whole[1] - n) // 2
         self._crop = slice(self.origin[0], self.origin[0] + m), slice(self.origin[1], self.origin[1] + n)
-        sides = zip(self.scene, self.whole, self.origin, self.sensor, strict=True)
+        self._plane = self.scene
+        sides = zip(self._plane, self.whole, self.origin, self.sensor, strict=True)
         least = (max(scene, whole - origin, origin + size) for scene, whole, origin, size in sides)
         down, across = (fft.next_fast_len(each, real=True) for each in least)
         self.grid = down, across
@@ -114,6 +120,12 @@ class ShiftedLight:
                     f"frames of {self.sensor[0]} x {self.sensor[1]} pixels: light reaches {self.whole[0]} x "
                     f"{self.whole[1]} of them; give a point spread function of the frames' pixels, or patterns of more"
                 )
+        if self.deep:
+            self.scene, self.window = (len(self.psf), *self.scene), (slice(None), *self.window)
+
+    @property
+    def deep(self) -> bool:
+        return self.psf.ndim == 3 and self.places is None
 
     @classmethod
     def of(cls, psf: FloatArray, n: int, sensor: tuple[int, int] | None = None) -> ShiftedLight:
@@ -123,8 +135,8 @@ class ShiftedLight:
         return cls(psf, sensor or (rows, columns), (np.ones((n, 1)), np.ones((n, 1))))
 
     def under(self, family: PatternFamily) -> ShiftedLight:
-        if (family.n, family.n) != self.scene:
-            sizes = f"patterns of {family.n} pixels a side for a scene of {self.scene[0]}"
+        if (family.n, family.n) != self._plane:
+            sizes = f"patterns of {family.n} pixels a side for a scene of {self._plane[0]}"
             raise MitsimError(f"{sizes}; both need the same")
         return replace(self, patterns=(family.left.astype(np.float64), family.right.astype(np.float64)))
 
@@ -137,68 +149,89 @@ class ShiftedLight:
         frames = np.empty((self.count, *self.sensor), self.precision)
         rows, columns = self._crop
         for frame, light in zip(frames, self._lights, strict=True):
-            seen = fft.rfft2(scene if light is None else light * scene, self.grid)
-            seen *= self.spectrum
+            seen = np.zeros((), self.spectrum.dtype)
+            for part, weight, spectrum in self._parts(scene, light):
+                one = fft.rfft2(part if weight is None else weight * part, self.grid)
+                one *= spectrum
+                seen = seen + one
             # Rows beside the sensor are not made: a quarter of the time.
             frame[:] = fft.irfft(fft.ifft(seen, axis=0, overwrite_x=True)[rows], self.grid[1])[:, columns]
         return frames if self.seen is None else frames * self.seen
 
     def correlate(self, frames: Array) -> Array:
-        """Return the adjoint (n, n') of :meth:`image_of` for ``frames`` (K K', m, m')."""
-        (rows, columns), total = self.scene, np.zeros(self.scene, self.precision)
+        """Return the adjoint, a scene, of :meth:`image_of` for ``frames`` (K K', m, m')."""
+        (rows, columns), total = self._plane, np.zeros(self.scene, self.precision)
         placed = np.zeros((self.sensor[0], self.grid[1]), self.precision)
         for frame, light in zip(frames, self._lights, strict=True):
             placed[:, self._crop[1]] = frame
-            seen = np.zeros_like(self.spectrum)
+            seen = np.zeros(self.spectrum.shape[-2:], self.spectrum.dtype)
             seen[self._crop[0]] = fft.rfft(placed)
-            seen = fft.fft(seen, axis=0, overwrite_x=True) * self.spectrum.conj()
-            part = fft.irfft2(seen, self.grid)[:rows, :columns]
-            total += part if light is None else light * part
+            seen = fft.fft(seen, axis=0, overwrite_x=True)
+            for own, weight, spectrum in self._parts(total, light):
+                part = fft.irfft2(seen * spectrum.conj(), self.grid)[:rows, :columns]
+                own += part if weight is None else weight * part
         return total
 
     def half_size(self) -> ShiftedLight | None:
         """Return the camera at half the size; None under patterns, with held-out pixels, or if too small."""
-        small = min(*self.psf.shape, *self.sensor) // 2 < _LEAST_SIDE
+        small = min(*self.psf.shape[-2:], *self.sensor) // 2 < _LEAST_SIDE
         return None if small or self.patterns is not None or self.seen is not None else self.reduce(2)
 
     def reduce(self, factor: int) -> ShiftedLight:
         rows, columns = (size // factor for size in self.sensor)
-        return replace(self, psf=factor**2 * reduce_frame(self.psf, factor), sensor=(rows, columns))
+        places = None if self.places is None else self.places / factor
+        return replace(self, psf=factor**2 * reduce_frame(self.psf, factor), sensor=(rows, columns), places=places)
 
     def double(self, smaller: Array) -> Array:
-        """Return the image (n, n') of a ``smaller`` one of :meth:`half_size`, linear between its pixels.
+        """Return the scene of a ``smaller`` one of :meth:`half_size`, linear between its pixels.
 
         Pixel p of the smaller image is at 2 p + 1 for light of an even number of pixels, at 2 p + 2 for an odd one.
         """
         image = np.zeros(self.scene, self.precision)
-        place = image[tuple(slice(k % 2, None) for k in self.psf.shape)]
-        for axis in (0, 1):
+        place = image[..., self.psf.shape[-2] % 2 :, self.psf.shape[-1] % 2 :]
+        for axis in (-2, -1):
             smaller = np.repeat(smaller, 2, axis=axis)
             before = np.roll(smaller, 1, axis=axis)
             smaller = (smaller + before) / 2
-        rows, columns = (min(sizes) for sizes in zip(place.shape, smaller.shape, strict=True))
-        place[:rows, :columns] = smaller[:rows, :columns]
+        rows, columns = (min(sizes) for sizes in zip(place.shape[-2:], smaller.shape[-2:], strict=True))
+        place[..., :rows, :columns] = smaller[..., :rows, :columns]
         return image
 
     def preconditioner(self, ridge: float, slope_weight: float) -> Operator:
-        """Return the division by |H|^2 + mu + ridge - slope_weight Laplacian under uniform light, else the identity."""
+        """Return the division by |H|^2 + mu + ridge - slope_weight Laplacian under uniform light, else the identity.
+
+        With D depths the divisor is, for each frequency, the matrix d 1 + conj(H) H^T of rank one beside d = mu + ridge
+        - slope_weight Laplacian, whose inverse is that of Sherman and Morrison.
+        """
         if self.patterns is not None:
             return lambda image: image
-        total = np.square(np.abs(self.spectrum)) + 10.0 * float(np.square(self.psf).sum()) + ridge
+        power, deep = np.square(np.abs(self.spectrum)), self.deep
+        power = power.mean(axis=0) if self.places is not None else power.sum(axis=0) if deep else power
+        total = (np.zeros_like(power) if deep else power) + (1.0 if deep else 10.0) * self._power + ridge
         if slope_weight:
             rows, columns = (2 - 2 * np.cos(2 * np.pi * np.arange(size) / size) for size in self.grid)
-            total += slope_weight * (rows[:, None] + columns[: total.shape[1]])
+            # A slice has two neighbours.
+            total += slope_weight * (rows[:, None] + columns[: power.shape[1]] + (2 if deep else 0))
         divisor = np.asarray(1 / total, self.precision)
+        shared = np.asarray(1 / (total + power), self.precision)
 
         def divide(image: Array) -> Array:
-            rows, columns = image.shape
-            return np.asarray(fft.irfft2(fft.rfft2(image, self.grid) * divisor, self.grid)[:rows, :columns])
+            rows, columns = self._plane
+            left = fft.rfft2(image, self.grid)
+            if deep:
+                left -= self.spectrum.conj() * (shared * (self.spectrum * left).sum(axis=0))
+            left *= divisor
+            return np.asarray(fft.irfft2(left, self.grid)[..., :rows, :columns])
 
         return divide
 
     @property
+    def _power(self) -> float:
+        return float(np.square(self.psf).sum()) / (1 if self.psf.ndim == 2 else len(self.psf))
+
+    @property
     def column_power(self) -> float:
-        power = float(np.square(self.psf).sum())
+        power = self._power
         if self.patterns is None:
             return power
         left, right = (float(np.square(side).sum(axis=1).mean()) for side in self.patterns)
@@ -215,11 +248,30 @@ class ShiftedLight:
         left, right = (side.T.astype(self.precision) for side in self.patterns)
         return (np.outer(row, column) for row in left for column in right)
 
+    @cached_property
+    def _blend(self) -> Array:
+        """Weights (D, n, n') of the lights at each place of the scene."""
+        assert self.places is not None
+        sides = zip(self._plane, self.origin, self.psf.shape[-2:], self.sensor, strict=True)
+        rows, columns = (np.arange(n) - origin + (k - m) / 2 for n, origin, k, m in sides)
+        return blend(self.places, rows, columns).astype(self.precision)
+
+    def _parts(self, scene: Array, light: Array | None) -> Iterable[tuple[Array, Array | None, Array]]:
+        """Return parts of a ``scene`` under one pattern, their weights, and the spectra that they are seen by."""
+        if self.psf.ndim == 2:
+            return [(scene, light, self.spectrum)]
+        if self.deep:
+            return ((part, light, spectrum) for part, spectrum in zip(scene, self.spectrum, strict=True))
+        weights = (weight if light is None else light * weight for weight in self._blend)
+        return ((scene, weight, spectrum) for weight, spectrum in zip(weights, self.spectrum, strict=True))
+
 
 # ---- Noise, weight and misfit ----------------------------------------------------------------------------------------
 
 _RIDGE, _WEIGHT = 50.0, 1.2
 """Lambda over the mean square of a pixel's light, by relative error; TV's weight in units of the gradient's error."""
+_DEEP, _MOST, _MOST_DEEP = 0.2, 300, 1000
+"""Weight of volumes over that of images (lambda: its square), whose slices are darker; steps of images and volumes."""
 _SIDE, _STEPS = 128, 60
 _HALVES = range(-16, 7)
 _TURNED = {"turned by 180 degrees": (-1, -1), "mirrored left to right": (1, -1), "mirrored upside down": (-1, 1)}
@@ -235,8 +287,8 @@ def frame_noise(frame: Array) -> float:
 
 
 def _shrink(light: ShiftedLight, frames: Array) -> tuple[ShiftedLight, Array, int]:
-    factor = 1 if light.patterns else max(min(*light.sensor, *light.psf.shape) // _SIDE, 1)
-    return light.reduce(factor), np.stack([reduce_frame(frame, factor) for frame in frames]), factor
+    factor = 1 if light.patterns else max(min(*light.sensor, *light.psf.shape[-2:]) // _SIDE, 1)
+    return light.reduce(factor), reduce_frame(frames, factor), factor
 
 
 def frame_error(light: ShiftedLight, frames: Array) -> float:
@@ -289,16 +341,23 @@ def find_fit(light: ShiftedLight, frames: Array, variance: float | None) -> Poin
     rough, fine = (3.0, 0.3)
     (objective, left), (alternative, chi_square) = cost(small.psf, rough), cost(small.psf, fine)
     rough, objective = (fine, alternative) if left > 4.0 else (rough, objective)
-    others, grid = dict[str, float](), [2 * size for size in small.psf.shape]
+    others, grid = dict[str, float](), [2 * size for size in small.psf.shape[-2:]]
     for name, (down, across) in _TURNED.items():
-        copy = small.psf[::down, ::across]
-        shifted = fft.irfft2(fft.rfft2(small.psf, grid) * fft.rfft2(copy, grid).conj(), grid)
+        copy = small.psf[..., ::down, ::across]
+        shared = (fft.rfft2(small.psf, grid) * fft.rfft2(copy, grid).conj()).reshape(-1, grid[0], grid[1] // 2 + 1)
+        shifted = fft.irfft2(shared.sum(axis=0), grid)
         if shifted.max() < 0.9 * math.sqrt(float(np.square(small.psf).sum() * np.square(copy).sum())):
             others[name] = cost(copy, rough)[0]
     reading = min(others, key=lambda name: others[name], default="")
+    depths = len(small.psf) if small.deep else 0
+    without = [cost(np.delete(small.psf, k, 0), fine)[0] / max(alternative, 1e-300) for k in range(depths)]
     energy = max(float(np.mean(np.square(seen, dtype=np.float64))), 1e-300)
-    off = [float(np.average(place, weights=np.abs(light.psf))) for place in np.indices(light.psf.shape)]
-    rows, columns = light.psf.shape
+    rows, columns = light.psf.shape[-2:]
+    middles = [
+        [float(np.average(place, weights=np.abs(each))) for place in np.indices((rows, columns))]
+        for each in light.psf.reshape(-1, rows, columns)
+    ]
+    off = max(middles, key=lambda each: max(abs(2 * each[0] / (rows - 1) - 1), abs(2 * each[1] / (columns - 1) - 1)))
     return PointSpreadFit(
         chi_square=chi_square,
         unexplained=math.sqrt(max(chi_square - 1, 0.0) * noise / energy),
@@ -307,6 +366,7 @@ def find_fit(light: ShiftedLight, frames: Array, variance: float | None) -> Poin
         reading=reading,
         off=(off[0] - (rows - 1) / 2, off[1] - (columns - 1) / 2),
         size=(rows, columns),
+        without=tuple(without),
     )
 
 
@@ -315,10 +375,11 @@ def find_fit(light: ShiftedLight, frames: Array, variance: float | None) -> Poin
 
 def automatic_weight(light: ShiftedLight, frames: Array, method: str) -> float:
     """Return lambda, or the weight of the total variation, for ``frames`` (K K', m, m')."""
+    part = _DEEP if light.deep else 1.0
     if method == TV:
-        return _WEIGHT * frame_error(light, frames) * math.sqrt(light.column_power)
+        return part * _WEIGHT * frame_error(light, frames) * math.sqrt(light.column_power)
     if light.patterns is None:
-        return _RIDGE * frame_error(light, frames) / float(frames.mean()) * light.column_power
+        return part**2 * _RIDGE * frame_error(light, frames) / float(frames.mean()) * light.column_power
     raise MitsimError("lambda auto: is chosen under uniform light alone; under patterns give lambda as a number")
 
 
@@ -328,11 +389,12 @@ def solve_point_spread(
     method: str,
     lam: float | Literal["auto"] = "auto",
     bounds: Bounds | None = None,
-    iterations: int = 300,
+    iterations: int | None = None,
     tolerance: float = 0.02,
 ) -> Solution:
-    """Return the image of all frames (K K', m, m')."""
+    """Return the image, or volume, of all frames (K K', m, m')."""
     light.check_frames(frames)
+    iterations = (_MOST_DEEP if light.deep else _MOST) if iterations is None else iterations
     if iterations < 1:
         raise MitsimError(f"iterations are {iterations}; give at least 1")
     prior = Prior(bounds=bounds or (Prior.bounds if method == TIKHONOV else (0.0, math.inf)))
@@ -378,7 +440,8 @@ def reconstruct_psf(
         Capture in memory, or of :func:`mitsim.core.runs.load_run`.
     psf
         Light (k, k') of a scene pixel, or a picture of it (:func:`mitsim.devices.camera.load_psf`), of the same
-        pixels as the frames.
+        pixels as the frames; or a list of several (:mod:`mitsim.reconstruct.light_list`), LIST.toml, by depth, which
+        gives a volume, or by place in the field.
     reduce
         Pixels a side, of frames and of the picture, that become one.
     lam
@@ -402,20 +465,20 @@ def reconstruct_psf(
 
 @single_threaded_blas()
 def reconstruct_psf_request(
-    shots: Capture, psf: Path | str | FloatArray, reduce: int, request: ImageRequest, job: Job | None = None
+    shots: Capture, psf: Path | str | FloatArray | Lights, reduce: int, request: ImageRequest, job: Job | None = None
 ) -> Reconstruction:
     request.check_point_spread(reduce)
-    return SeenFrames(shots, _light(psf, reduce), reduce, job).image(request, request.lam)
+    return SeenFrames(shots, lights_of(psf, reduce), reduce, job).image(request, request.lam)
 
 
 class SeenFrames:
-    """Frames (K K', m, m') of a run, and the camera that sees them by the ``light`` of a point.
+    """Frames (K K', m, m') of a run, and the camera that sees them by the ``lights`` of points.
 
-    ``reduce`` x ``reduce`` pixels of the frames become one, as those of the light did.
+    ``reduce`` x ``reduce`` pixels of the frames become one, as those of the lights did.
     """
 
-    def __init__(self, shots: Capture, light: FloatArray, reduce: int, job: Job | None = None) -> None:
-        self.shots, self.light, self.reduce = shots, light, reduce
+    def __init__(self, shots: Capture, lights: Lights, reduce: int, job: Job | None = None) -> None:
+        self.shots, self.lights, self.reduce = shots, lights, reduce
         self._clock, self._saturated, variance = (job or Job()).apart("").clock, 0, 0.0
         with self._clock.stage("read"):
             (left, right), digital = shots.patterns, shots.manifest.digital
@@ -424,8 +487,9 @@ class SeenFrames:
                 raise MitsimError(f"{shots.name}: frames of {rows} x {columns} pixels; reduce by less than {reduce}")
             uniform = all(side.shape[1] == 1 and bool((side == 1).all()) for side in (left, right))
             sensor = rows // reduce, columns // reduce
-            camera = ShiftedLight(light, sensor, None if uniform else shots.patterns, np.float32)
-            numbers = camera.grid[0] * camera.grid[1] + camera.count * sensor[0] * sensor[1]
+            patterns = None if uniform else shots.patterns
+            camera = ShiftedLight(lights.light, sensor, patterns, np.float32, places=lights.places)
+            numbers = camera.grid[0] * camera.grid[1] * lights.count + camera.count * sensor[0] * sensor[1]
             Cost(memory_bytes=4.0 * 24 * numbers).check(f"{shots.name}: its image", Limits())
             frames = np.empty((camera.count, *sensor), np.float32)
             for each in shots.pattern_measurements((rows, columns)):
@@ -441,35 +505,50 @@ class SeenFrames:
             solution = solve_point_spread(self.camera, self.frames, request.name, lam, **request.iterative)
         with self._clock.stage("misfit"):
             fit = find_fit(self.camera, self.frames, self._variance)
-        status = fit.judge(solution.status)
-        flags = [*each_once({"the capture": self.shots.warnings})]
+        status, focus, depths, doubt = fit.judge(solution.status), None, self.lights.depths_mm, self.lights.doubt
+        if depths is not None:
+            slices, energy = solution.image, float(np.square(self.frames, dtype=np.float64).sum())
+            doubt = fit.doubt_of(slices, depths)
+            solution = replace(solution, image=slices.sum(axis=0))
+            mm, confidence = mean_depth(slices, depths, float(depths.mean()))
+            focus = Volume(
+                solution.image, mm, confidence, solution.lam, solution.residual**2 * energy, energy, self.frames.size,
+                1.0, doubt, (float(depths[0]), float(depths[-1])), slices=slices, depths_mm=depths, solution=solution,
+            )  # fmt: skip
+        flags = [*filter(None, [doubt]), *each_once({"the capture": self.shots.warnings})]
         if self._saturated:
             flags.append(f"{self._saturated} readings are at the full well or the ADC's end: use a shorter exposure.")
         return Reconstruction(
             **{**vars(solution), "status": replace(status, flags=(*status.flags, *flags))},
             fit=fit,
+            focus=focus,
             seconds={stage: spent for stage, spent in self._clock.seconds().items() if stage != "total"},
-            inputs=psf_inputs(self.shots, self.light, self.reduce, request),
+            inputs=psf_inputs(self.shots, self.lights, self.reduce, request),
         )
 
 
-def psf_inputs(shots: Capture, psf: FloatArray, reduce: int, request: ImageRequest) -> dict[str, Any]:
-    digest = hashlib.sha256(f"{psf.shape}".encode() + np.ascontiguousarray(psf).tobytes()).hexdigest()
-    asked = {"run": shots.fingerprint, POINT_SPREAD: digest, "reduce": reduce, "lambda": request.lam}
+def psf_inputs(shots: Capture, lights: Lights, reduce: int, request: ImageRequest) -> dict[str, Any]:
+    digest = hashlib.sha256(f"{lights.light.shape}".encode() + np.ascontiguousarray(lights.light).tobytes())
+    for where in (lights.depths_mm, lights.places):
+        digest.update(b"" if where is None else f"{where.shape}".encode() + where.tobytes())
+    asked = {"run": shots.fingerprint, POINT_SPREAD: digest.hexdigest(), "reduce": reduce, "lambda": request.lam}
     asked["method"] = request.method
     return {**asked, **request.plain}
 
 
-def _light(psf: Path | str | FloatArray, reduce: int) -> FloatArray:
+def lights_of(psf: Path | str | FloatArray | Lights, reduce: int) -> Lights:
+    if isinstance(psf, Lights):
+        return psf
     if isinstance(psf, (str, Path)):
-        return load_psf(psf, reduce)
+        path = Path(psf)
+        return load_lights(path, reduce) if path.suffix.lower() == LIST else Lights(load_psf(path, reduce))
     light = np.asarray(psf)
     if light.dtype.kind not in "uif":
         raise ArgumentError("psf", f"{cut(repr(psf))}: give rows x columns of real numbers, or a picture's path")
     light = light.astype(np.float64)
     if light.ndim != 2 or min(light.shape) < reduce:
         raise ArgumentError("psf", f"shape {light.shape}: give rows x columns, at least {reduce} a side")
-    return reduce_frame(light, reduce)
+    return Lights(reduce_frame(light, reduce))
 
 
 # ---- Least squares of many frames: conjugate gradients, and the classes of dots --------------------------------------

@@ -40,6 +40,9 @@ _TURNED, _EQUAL = 0.85, 0.98
 """Cost ratios of the best turned copy below which it is recommended, and below which the light is wrong."""
 _LEAST_GAIN, _RISE, _NOISY = 1.015, 0.02, 1.2
 """Least cost ratio of right light: the first times chi-square to the second; noise explains frames below the last."""
+_NEEDED, _SHARE = 1.1, 0.1
+"""Least cost ratio without a depth that has at least that share of the light. Of 30 simulated volumes above it 66 to
+82 % of the light was at the right depth, and below 33 to 57 %, or up to 84 % where a depth of the list was empty."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +50,8 @@ class PointSpreadFit:
     """Fit of frames to a point spread function.
 
     ``gain`` is the cost of the best turned or mirrored copy (``reading``) over that of the light as given, None where
-    all are alike. ``off`` is the distance [rows, columns] from the middle of the picture to the light's centre.
+    all are alike. ``without`` has that of the light without each depth. ``off`` is the distance [rows, columns] from
+    the middle of the picture to the light's centre.
     """
 
     chi_square: float
@@ -57,6 +61,7 @@ class PointSpreadFit:
     reading: str
     off: tuple[float, float]
     size: tuple[int, int]
+    without: tuple[float, ...] = ()
 
     @property
     def fault(self) -> tuple[str, str]:
@@ -98,7 +103,21 @@ class PointSpreadFit:
             "turned_cost": self.gain,
             "reading": self.reading if self.gain is not None and self.gain < _TURNED else None,
             "off_centre": list(self.off),
+            "without_depth": list(self.without) or None,
         }
+
+    def doubt_of(self, slices: FloatArray, depths_mm: FloatArray) -> str:
+        """Return a sentence if the frames do not need a depth of whose light much is in its slice."""
+        light = np.maximum(slices, 0.0).sum(axis=(1, 2))
+        share = light / max(float(light.sum()), 1e-300)
+        needless = [k for k, cost in enumerate(self.without) if cost < _NEEDED and share[k] > _SHARE]
+        if not needless:
+            return ""
+        places = ", ".join(f"{depths_mm[k]:g} mm ({share[k]:.0%} of the light)" for k in needless)
+        return (
+            f"Depths cannot be told apart: without {places} the frames are explained nearly as well; give depths "
+            "farther apart, or fewer; scenes of few small objects are told apart best."
+        )
 
     def judge(self, status: Status) -> Status:
         sentence, remedy = self.fault

@@ -17,7 +17,8 @@ if TYPE_CHECKING:
     from mitsim.reconstruct.factors import Factors
 
 TIKHONOV, MARKOV, NONNEGATIVE, TV = METHODS = ("tikhonov", "markov", "nonnegative", "tv")
-MODEL = ".pt"
+MODEL, LIST = ".pt", ".toml"
+"""Endings of a trained network, and of a list of point spread functions."""
 MOST_REDUCED = 1024
 _MOST = 1e100
 Bounds = tuple[float, float]
@@ -90,7 +91,8 @@ class ImageRequest(Options):
     )
     iterations: int | None = option(
         None,
-        "with nonnegative or tv: limit of the iterations; by default 5000, or 300 with --psf or --focus volume",
+        "with nonnegative or tv: limit of the iterations; by default 5000, or 300 with --psf (1000 for "
+        "depths) or --focus volume",
         min=1,
         metavar="N",
     )

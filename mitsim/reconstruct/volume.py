@@ -194,7 +194,7 @@ def solve_volume(
     parts = (left_over - variance * basis.data, GROSS), (inside - variance * basis.stack.size, _MISFIT)
     unexplained = [(math.sqrt(max(part, 0.0) / (basis.energy or 1.0)), most) for part, most in parts]
     slices = found.image.astype(np.float64)
-    depths_mm, weights = 1 / (inverse + shifts), np.maximum(slices, 0.0)
+    depths_mm = 1 / (inverse + shifts)
     light = slices.sum(axis=(1, 2))
     # Without bounds, noise gives slices light of either sign.
     least = max(_END * float(light.sum()), -float(light.min()))
@@ -215,17 +215,23 @@ def solve_volume(
     if found.fall > _TOLERANCE:
         status = Status(Verdict.NOT_CONVERGED, f"Not converged: {lowered} or more", "allow more iterations")
     image = slices.sum(axis=0)
-    total = weights.sum(axis=0)
-    dark = total <= np.finfo(np.float32).eps * float(total.max())
-    share = weights / np.where(dark, 1.0, total)
-    mm = np.where(dark, 1 / inverse, np.tensordot(depths_mm, share, axes=1))
-    # Neighbouring depths share the light of a surface between them.
-    pairs = share[:-1] + share[1:] if count > 1 else share
+    mm, confidence = mean_depth(slices, depths_mm, 1 / inverse)
     residual = math.sqrt(left_over / basis.energy) if basis.energy else 0.0
     solution = Solution(image, known, residual, status, None, found.iterations, found.objective)
     sizes = left_over, basis.energy, basis.data, basis.part
     range_mm = float(depths_mm.min()), float(depths_mm.max())
     return Volume(
-        image, mm, pairs.max(axis=0), known, *sizes, doubt, range_mm,
+        image, mm, confidence, known, *sizes, doubt, range_mm,
         slices=slices, depths_mm=depths_mm, solution=solution,
     )  # fmt: skip
+
+
+def mean_depth(slices: FloatArray, depths_mm: FloatArray, dark_mm: float) -> tuple[FloatArray, FloatArray]:
+    """Return the mean depth (n, n') of ``slices`` (D, n, n'), ``dark_mm`` without light, and its confidence."""
+    weights = np.maximum(slices, 0.0)
+    total = weights.sum(axis=0)
+    dark = total <= np.finfo(np.float32).eps * float(total.max())
+    share = weights / np.where(dark, 1.0, total)
+    # Neighbouring depths share the light of a surface between them.
+    pairs = share[:-1] + share[1:] if len(slices) > 1 else share
+    return np.where(dark, dark_mm, np.tensordot(depths_mm, share, axes=1)), pairs.max(axis=0)

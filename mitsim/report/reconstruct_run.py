@@ -25,7 +25,7 @@ from mitsim.core.job import Job
 from mitsim.core.manifests import CalibrationManifest, read_manifest
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.runs import load_mosaic, load_run
-from mitsim.devices.camera import load_psf, load_psf_channels
+from mitsim.devices.camera import load_psf_channels
 from mitsim.devices.framelist import ChartPlace
 from mitsim.metrics import Quality, summary_of, truth_error_for, truth_for
 from mitsim.optics.terms import best_term
@@ -33,7 +33,7 @@ from mitsim.reconstruct.colour import PLANES, ColourModel, JointMosaic
 from mitsim.reconstruct.factors import load_calibration
 from mitsim.reconstruct.misfit import UNEXPLAINED
 from mitsim.reconstruct.reconstruct import MADE_OF, Reconstruction, check_same_inputs, may_replace, reconstruct_request
-from mitsim.reconstruct.request import IMAGE_FILE, PICTURE_FILE, ImageRequest, check_joint
+from mitsim.reconstruct.request import IMAGE_FILE, LIST, PICTURE_FILE, ImageRequest, check_joint
 from mitsim.reconstruct.solver import Solution, automatic_lambda, prepare
 from mitsim.report.folder_page import ColourImage, report_folder, state_image
 
@@ -94,14 +94,14 @@ def reconstruct_psf(
     ``reduce`` x ``reduce`` pixels of frames and ``psf`` become one. The ``options`` are ``lam``, ``method``, ``bounds``
     and ``iterations``.
     """
-    from mitsim.reconstruct.point_spread import psf_inputs, reconstruct_psf_request
+    from mitsim.reconstruct.point_spread import lights_of, psf_inputs, reconstruct_psf_request
 
     request = ImageRequest(**options)
     request.check_point_spread(reduce)
-    shots, light = load_run(run), load_psf(psf, reduce)
-    replaces = may_replace(output, psf_inputs(shots, light, reduce, request), overwrite)
+    shots, lights = load_run(run), lights_of(psf, reduce)
+    replaces = may_replace(output, psf_inputs(shots, lights, reduce, request), overwrite)
     with output_folder(output, overwrite=replaces) as folder:
-        judged = Judged(reconstruct_psf_request(shots, psf, reduce, request, job), None, str(folder))
+        judged = Judged(reconstruct_psf_request(shots, lights, reduce, request, job), None, str(folder))
         judged.reconstruction.write(folder, {**judged.summary(), **_origin(job, run)})
     return judged
 
@@ -161,6 +161,8 @@ def reconstruct_colours(
     found = colour_files.open_lines(run, colour_files.RUN, colour_files.MOSAIC)
     lines = found.filters or colour_files.read_colours(run, colour_files.RUN)
     by_point, board = calibration.is_file(), None
+    if by_point and calibration.suffix.lower() == LIST:
+        raise MitsimError(f"{calibration}: lists are of one line, and {run} is coloured; give a picture")
     if by_point and (found.filters or chart):
         raise MitsimError(f"{calibration}: is no folder; runs behind colour filters, and charts, need a calibration")
     if not by_point:
@@ -243,6 +245,7 @@ def _solve_by_point(
     **options: Any,
 ) -> ColourImage:
     """Solve each line with its own channel of the light, and one lambda: channels of other sharpness have fringes."""
+    from mitsim.reconstruct.light_list import Lights
     from mitsim.reconstruct.point_spread import SeenFrames, automatic_weight, psf_inputs
 
     started, request = time.perf_counter(), ImageRequest(**options)
@@ -252,7 +255,7 @@ def _solve_by_point(
     (rows, columns), how = first.summary()["shape"], first.manifest.configuration.get("prepare")
     light = load_psf_channels(psf, lines.names, (rows, columns), how if isinstance(how, dict) else {}, reduce)
     totals = light.sum(axis=(1, 2))
-    inputs = psf_inputs(first, light, reduce, request)
+    inputs = psf_inputs(first, Lights(light), reduce, request)
     inputs["run"] = "-".join(each.fingerprint for each in shots.values())
     replaces = colour_files.is_coloured(output)
     if replaces and not overwrite:
@@ -261,7 +264,7 @@ def _solve_by_point(
     with output_folder(output, overwrite=replaces) as folder:
         channels = (light / totals[:, None, None]).repeat(len(lines.names) // len(light), axis=0)
         seen = {
-            name: SeenFrames(each, channel, reduce, job.apart(f"{name} "))
+            name: SeenFrames(each, Lights(channel), reduce, job.apart(f"{name} "))
             for (name, each), channel in zip(shots.items(), channels, strict=True)
         }
         lam = request.lam

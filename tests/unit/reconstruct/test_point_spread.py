@@ -39,6 +39,10 @@ def spread(rows: int = 5, columns: int = 4) -> np.ndarray:
     return light / light.sum()
 
 
+SEVERAL = np.stack([spread(), spread()[::-1]])
+PLACES = np.array([[-2.0, 0.0], [2.0, 0.0]])
+
+
 def dots(rows: int, columns: int, period: int) -> tuple[np.ndarray, np.ndarray]:
     lit = (np.arange(size)[:, None] % period == np.arange(period) for size in (rows, columns))
     rows_lit, columns_lit = (each.astype(float) for each in lit)
@@ -46,20 +50,26 @@ def dots(rows: int, columns: int, period: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def matrix(light: ps.ShiftedLight) -> np.ndarray:
-    """(K K' m m', n n') from y[s] = sum_p h[s - p] x[p], the sensor centred in all that light reaches."""
-    rows, columns = light.psf.shape
-    whole = [n + k - 1 for n, k in zip(light.scene, light.psf.shape, strict=True)]
+    """(K K' m m', D n n') from y[s] = sum_p h_p[s - p] x[p], the sensor centred in all that light reaches.
+
+    The light is that of a depth, or a blend of those of two places, two rows above and below the middle of the frame.
+    """
+    rows, columns = light.psf.shape[-2:]
+    whole = [n + k - 1 for n, k in zip(light.scene[-2:], light.psf.shape[-2:], strict=True)]
     top, left = ((most - size) // 2 for most, size in zip(whole, light.sensor, strict=True))
     seen = []
-    for row, column in np.ndindex(*light.scene):
-        plane = np.zeros(whole)
-        plane[row : row + rows, column : column + columns] = light.psf
+    for *depth, row, column in np.ndindex(*light.scene):
+        plane, psf = np.zeros(whole), light.psf[tuple(depth)]
+        if light.places is not None:
+            below = np.clip((row - top + (rows - light.sensor[0]) / 2 + 2) / 4, 0, 1)
+            psf = (1 - below) * light.psf[0] + below * light.psf[1]
+        plane[row : row + rows, column : column + columns] = psf
         seen.append(plane[top : top + light.sensor[0], left : left + light.sensor[1]].ravel())
     one = np.stack(seen, axis=1)
     if light.patterns is None:
         return one
     lit = [np.outer(row, column).ravel() for row in light.patterns[0].T for column in light.patterns[1].T]
-    return np.concatenate([one * each for each in lit])
+    return np.concatenate([one * np.tile(each, one.shape[1] // each.size) for each in lit])
 
 
 LIGHTS = [
@@ -67,8 +77,13 @@ LIGHTS = [
     ps.ShiftedLight(spread(4, 5), (9, 3)),
     ps.ShiftedLight(spread(), (7, 6), dots(8, 7, 2)),
     ps.ShiftedLight(spread(), (12, 10), dots(8, 7, 1)),
+    ps.ShiftedLight(SEVERAL, (4, 3)),
+    ps.ShiftedLight(SEVERAL, (7, 6), dots(6, 7, 2)),
+    ps.ShiftedLight(SEVERAL, (6, 5), places=PLACES),
+    ps.ShiftedLight(SEVERAL, (7, 6), dots(8, 7, 2), places=PLACES),
 ]
-"""More unknowns than data, twice; cropped frames of dots; all light of a scene, which is dark beyond."""
+"""More unknowns than data, twice; cropped frames of dots; all light of a scene, which is dark beyond; two depths; a
+light that changes over the field."""
 
 
 def noisy(light: ps.ShiftedLight, seed: int = 0) -> np.ndarray:
@@ -86,7 +101,7 @@ def test_frames_are_the_definition_s_and_their_adjoint_is_the_transpose(light: p
     frames = light.image_of(scene)
     np.testing.assert_allclose(frames.ravel(), whole @ scene.ravel(), atol=1e-13)
     if light.patterns is None:
-        assert [part.start for part in light.window] == [(size - 1) // 2 for size in light.psf.shape]
+        assert [part.start for part in light.window[-2:]] == [(size - 1) // 2 for size in light.psf.shape[-2:]]
     data = rng.normal(size=frames.shape)
     np.testing.assert_allclose(light.correlate(data).ravel(), whole.T @ data.ravel(), atol=1e-13)
     assert np.square(whole).sum(axis=0).mean() <= light.column_power * (1 + 1e-12)
@@ -130,13 +145,18 @@ def test_total_variation_comes_to_its_minimum(light: ps.ShiftedLight, weight: fl
 
 
 def test_half_the_size_sees_half_the_frame() -> None:
-    """Of a scene without fine detail; a pixel beside, the two differ by a tenth. (Planted: a start one pixel off.)"""
-    for side in (70, 71):
+    """Of a scene without fine detail; a pixel beside, the two differ by a tenth. (Planted: a start one pixel off;
+    places not halved.)"""
+    for side, places in ((70, None), (71, None), (70, 12 * PLACES), (71, "depths")):
         rows, columns = np.mgrid[:side, :side] / side - 0.5
-        light = ps.ShiftedLight(np.exp(-60 * (rows - 0.1) ** 2 - 90 * columns**2) / 100, (80, 82))
+        psf = np.exp(-60 * (rows - 0.1) ** 2 - 90 * columns**2) / 100
+        if places is None:
+            light = ps.ShiftedLight(psf, (80, 82))
+        else:
+            light = ps.ShiftedLight(np.stack([psf, 2 * psf.T]), (80, 82), places=places if side == 70 else None)
         half = light.half_size()
         assert half.sensor == (40, 41) and half.half_size() is None
-        rows, columns = np.mgrid[: half.scene[0], : half.scene[1]]
+        rows, columns = np.indices(half.scene)[-2:]
         scene = 1 + np.sin(rows / 6) * np.cos(columns / 7)
         seen, expected = reduce_frame(light.image_of(light.double(scene))[0], 2), half.image_of(scene)[0]
         inside = np.s_[5:-5, 5:-5]
@@ -377,11 +397,17 @@ def light_of_a_point() -> np.ndarray:
 
 def capture(name: str, sensor: tuple[int, int], saturation: float | None = None) -> tuple[Capture, np.ndarray]:
     """Frames of a scene of two numbers, and the scene."""
-    family, memory, psf = parse_patterns(name, SCENE_SIZE), Recorder(), light_of_a_point()
-    rng = np.random.default_rng(1)
+    family = parse_patterns(name, SCENE_SIZE)
     patterns = None if name == "uniform" else (family.left.astype(float), family.right.astype(float))
-    light = ps.ShiftedLight(psf, sensor, patterns)
+    light = ps.ShiftedLight(light_of_a_point(), sensor, patterns)
     scene = np.where(np.arange(light.scene[0])[:, None] % 4 < 2, 2000.0, 0.0) * np.ones(light.scene)
+    return record(light, scene, name, saturation), scene[light.window]
+
+
+def record(
+    light: ps.ShiftedLight, scene: np.ndarray, name: str = "uniform", saturation: float | None = None
+) -> Capture:
+    family, memory, rng = parse_patterns(name, SCENE_SIZE), Recorder(), np.random.default_rng(1)
     for index, frame in enumerate(light.image_of(scene)):
         memory.write_frame(index, {"DN": rng.poisson(np.maximum(frame, 0) + 10).astype(np.uint32)}, {})
     files = [frame_name(index) for index in range(light.count)]
@@ -396,7 +422,7 @@ def capture(name: str, sensor: tuple[int, int], saturation: float | None = None)
         digital=digital,
         patterns=Patterns.of(family, files),
     )
-    return memory.finish(manifest), scene[light.window]
+    return memory.finish(manifest)
 
 
 def test_dots_find_the_scene_and_uniform_light_all_that_the_sensor_sees() -> None:
