@@ -3,6 +3,8 @@
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,8 +15,8 @@ from mitsim.core.images import reduce_frame
 from mitsim.devices.mask import mls_mask
 from mitsim.report import EQUAL_FRAME, EQUAL_PEAK, EQUAL_TOTAL, IDEALISED, RENDERED
 from mitsim.report.lit_scene import DIM, DIM_E, Plane
-from mitsim.studies.camera_studies import modulation
-from mitsim.studies.framework.experiment import TEST_IMAGES, Setup
+from mitsim.studies.camera_studies import MAP, SEVERAL, UNIFORM, VOLUME, modulation
+from mitsim.studies.framework.experiment import TEST_IMAGES, Results, Scope, Setup
 from mitsim.studies.framework.studio import SIDE, Image, Studio, picture
 from tests.shadow_factor import scene_factor
 
@@ -42,6 +44,31 @@ def test_bars_have_their_frequency_both_ways() -> None:
     assert set(np.unique(values)) == {13, 230} and values.mean() == pytest.approx((13 + 230) / 2)
     fine = picture("bars 0.7").astype(float)
     assert fine.mean() == pytest.approx((12.75 + 229.5) / 2, rel=0.01), "texels across an edge are part black"
+
+
+def test_depths_of_volumes_are_judged_where_light_is_seen() -> None:
+    """Of four pixels one is dark and one unseen, the others are off by 3 and 4 mm. Maps win by the median error alone.
+    (Planted: all pixels; the side of the range that is left out; the sign of a claim on errors.)"""
+    asked, off = dict[str, Any](), {MAP: np.array([0.0, 6.0]), VOLUME: np.array([3.0, 4.0]), UNIFORM: np.full(2, 30.0)}
+    depths, gain = np.array([[360.0, 440.0], [400.0, np.nan]]), {MAP: 40.0, VOLUME: 41.0, UNIFORM: 12.0}
+
+    def image(*args: Any, **options: Any) -> Any:
+        asked.update(options)
+        return SimpleNamespace(image=depths, depths_mm=np.array([[*off[way] + depths[0]], [0, 0]]),
+                               row=lambda: {"psnr_db": gain[way]})  # fmt: skip
+
+    scene = SimpleNamespace(truth=np.array([[1.0, 0.5], [0.0, 1.0]]))
+    stand: Any = SimpleNamespace(once=lambda *_: depths, image=image, lit_scene=lambda _: scene)
+    points, rows = SEVERAL.points(Scope(Setup(), ("coins",))), []
+    for point in points:
+        way = point["way"]
+        rows += SEVERAL.measure(stand, point).rows
+        assert asked["focus"] == (MAP if way == MAP else VOLUME)
+        assert asked.get("depth_range") == ((0.97 * 360, 1.03 * 440) if way == UNIFORM else None) or way == MAP
+    assert rows[1]["rms_mm"] == pytest.approx(12.5**0.5) and rows[1]["median_mm"] == 3.5
+    assert len(points) == 27 and len(SEVERAL.points(Scope(Setup(), ("coins",), quick=True))) == 9
+    verdicts = [claim.verdict for claim in SEVERAL.judge(Results(rows))]
+    assert verdicts == ["confirmed"] * 8 + ["not confirmed"] * 3
 
 
 @pytest.mark.parametrize("name", TEST_IMAGES)
