@@ -138,8 +138,8 @@ def _check_default(shots: Capture, factors: Factors, period: float, pixel: float
     if period < _LEAST_PERIOD * pixel:
         raise ArgumentError(
             "depth_range",
-            f"none: the dots repeat after {period / pixel:.0f} projector pixels of parallax; use dots of a longer "
-            "period along the baseline, such as dots:7x16, or give the nearest and the farthest depth",
+            f"none: the dots repeat within {_LEAST_PERIOD} projector pixels of parallax; use dots of a longer period "
+            "along the baseline, such as dots:7x16, or give the nearest and the farthest depth",
         )
     middle, found = 1 / parallax_of(factors).depth_mm, best_depth(shots, factors).mm
     if abs(1 / found - middle) > period / 2:
