@@ -150,12 +150,14 @@ def blend(places: FloatArray, rows: FloatArray, columns: FloatArray) -> FloatArr
     else:
         order = np.argsort(places @ along)
         edges = np.stack([order[:-1], order[1:]], axis=1)
-    starts, steps = places[edges[:, 0]], places[edges[:, 1]] - places[edges[:, 0]]
-    away = points[outside] - starts[:, None]
-    parts = np.clip(np.einsum("epi,ei->ep", away, steps) / np.square(steps).sum(axis=1)[:, None], 0.0, 1.0)
-    distances = np.square(away - parts[..., None] * steps[:, None]).sum(axis=-1)
-    nearest, numbers = distances.argmin(axis=0), np.flatnonzero(outside)
-    part = parts[nearest, np.arange(len(numbers))]
-    weights[edges[nearest, 0], numbers] = 1 - part
-    weights[edges[nearest, 1], numbers] = part
+    far, numbers = points[outside], np.flatnonzero(outside)
+    nearest = np.full(len(far), np.inf)
+    for first, last in edges:
+        step = places[last] - places[first]
+        part = np.clip((far - places[first]) @ step / (step @ step), 0.0, 1.0)
+        distance = np.square(far - places[first] - part[:, None] * step).sum(axis=1)
+        nearer = distance < nearest
+        nearest[nearer] = distance[nearer]
+        weights[:, numbers[nearer]] = 0.0
+        weights[first, numbers[nearer]], weights[last, numbers[nearer]] = 1 - part[nearer], part[nearer]
     return weights.reshape(len(places), len(rows), len(columns))

@@ -489,7 +489,8 @@ class SeenFrames:
             sensor = rows // reduce, columns // reduce
             patterns = None if uniform else shots.patterns
             camera = ShiftedLight(lights.light, sensor, patterns, np.float32, places=lights.places)
-            numbers = camera.grid[0] * camera.grid[1] * lights.count + camera.count * sensor[0] * sensor[1]
+            several = lights.count if camera.deep else 1 + lights.count / 4
+            numbers = camera.grid[0] * camera.grid[1] * several + camera.count * sensor[0] * sensor[1]
             Cost(memory_bytes=4.0 * 24 * numbers).check(f"{shots.name}: its image", Limits())
             frames = np.empty((camera.count, *sensor), np.float32)
             for each in shots.pattern_measurements((rows, columns)):

@@ -113,10 +113,10 @@ class PointSpreadFit:
         needless = [k for k, cost in enumerate(self.without) if cost < _NEEDED and share[k] > _SHARE]
         if not needless:
             return ""
-        places = ", ".join(f"{depths_mm[k]:g} mm ({share[k]:.0%} of the light)" for k in needless)
+        places = " or ".join(f"{depths_mm[k]:g} mm ({share[k]:.0%} of the light)" for k in needless)
         return (
-            f"Depths cannot be told apart: without {places} the frames are explained nearly as well; give depths "
-            "farther apart, or fewer; scenes of few small objects are told apart best."
+            f"Depths are uncertain: the frames are explained nearly as well without {places}; leave one out, or give "
+            "depths farther apart. Few small objects are told apart best."
         )
 
     def judge(self, status: Status) -> Status:

@@ -48,6 +48,8 @@ _ABOVE_BLACK = "DN above the black level"
 _TRUTH = "image that a perfect camera would recover; projector pixels whose light the camera cannot see are black"
 _MISFIT = 2.0
 """Least end of the scale of chi-square, so that chance does not fill the scale."""
+_SLICES = 6
+"""Most slices of a volume in its picture."""
 _SHOWN_PERCENT = 99.0
 """Percentage of the errors that lie within the scale of their picture."""
 
@@ -283,6 +285,13 @@ def _of_image(folder: Path) -> Shown:
     pictures = [Picture.of("image", "The image", image, about, unit, (0.0, most))]
     if truth is not None and truth.shape == image.shape:
         pictures += [Picture.of("truth", "The truth", truth, _TRUTH), _difference("error", "Difference", image, truth)]
+    if (path := folder / reconstruct.VOLUME_FILE).is_file():
+        volume, depths = read_frame(path)[0], result.get("volume_depths_mm")
+        names = [sorted(volume)[k] for k in sorted({int(k) for k in np.linspace(0, len(volume) - 1, _SLICES)})]
+        known = dict(zip(sorted(volume), depths, strict=False)) if isinstance(depths, list) else {}
+        about = "from left to right at " + ", ".join(f"{known.get(name, name)} mm" for name in names)
+        strip = np.concatenate([finite_channel(volume, name, path) for name in names], axis=1)
+        pictures.append(Picture.of("slices", "Slices of the volume", strip, about, unit, (0.0, None), wide=True))
     sigma, depth = reconstruct.UNCERTAINTY_FILE, reconstruct.DEPTH_FILE
     for file, channel, title, about, unit, ends in (
         (sigma, "uncertainty", "Standard uncertainty", "without the truth", REFLECTANCE, (0.0, None)),
