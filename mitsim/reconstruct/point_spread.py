@@ -272,6 +272,8 @@ _RIDGE, _WEIGHT = 50.0, 1.2
 """Lambda over the mean square of a pixel's light, by relative error; TV's weight in units of the gradient's error."""
 _DEEP, _MOST, _MOST_DEEP = 0.2, 300, 1000
 """Weight of volumes over that of images (lambda: its square), whose slices are darker; steps of images and volumes."""
+_LIT = 0.05
+"""Part of the brightest pixel's light from which a pixel has a depth."""
 _SIDE, _STEPS = 128, 60
 _HALVES = range(-16, 7)
 _TURNED = {"turned by 180 degrees": (-1, -1), "mirrored left to right": (1, -1), "mirrored upside down": (-1, 1)}
@@ -511,7 +513,7 @@ class SeenFrames:
             slices, energy = solution.image, float(np.square(self.frames, dtype=np.float64).sum())
             doubt = fit.doubt_of(slices, depths)
             solution = replace(solution, image=slices.sum(axis=0))
-            mm, confidence = mean_depth(slices, depths, float(depths.mean()))
+            mm, confidence = mean_depth(slices, depths, float(depths.mean()), _LIT)
             focus = Volume(
                 solution.image, mm, confidence, solution.lam, solution.residual**2 * energy, energy, self.frames.size,
                 1.0, doubt, (float(depths[0]), float(depths[-1])), slices=slices, depths_mm=depths, solution=solution,

@@ -226,12 +226,17 @@ def solve_volume(
     )  # fmt: skip
 
 
-def mean_depth(slices: FloatArray, depths_mm: FloatArray, dark_mm: float) -> tuple[FloatArray, FloatArray]:
-    """Return the mean depth (n, n') of ``slices`` (D, n, n'), ``dark_mm`` without light, and its confidence."""
+def mean_depth(
+    slices: FloatArray, depths_mm: FloatArray, dark_mm: float, least: float = float(np.finfo(np.float32).eps)
+) -> tuple[FloatArray, FloatArray]:
+    """Return the mean depth (n, n') of ``slices`` (D, n, n') and its confidence.
+
+    Pixels with less than the part ``least`` of the brightest pixel's light have ``dark_mm``, and no confidence.
+    """
     weights = np.maximum(slices, 0.0)
     total = weights.sum(axis=0)
-    dark = total <= np.finfo(np.float32).eps * float(total.max())
-    share = weights / np.where(dark, 1.0, total)
+    dark = total <= least * float(total.max())
+    share = np.where(dark, 0.0, weights / np.where(dark, 1.0, total))
     # Neighbouring depths share the light of a surface between them.
     pairs = share[:-1] + share[1:] if len(slices) > 1 else share
     return np.where(dark, dark_mm, np.tensordot(depths_mm, share, axes=1)), pairs.max(axis=0)

@@ -46,7 +46,7 @@ def objects(camera: ps.ShiftedLight) -> np.ndarray:
 
 def test_a_volume_has_each_object_at_its_depth_and_alike_depths_are_flagged(tmp_path: Path) -> None:
     """Whichever order the list has. One light for both depths loses 10 dB. (Planted: slices in the list's order; no
-    depth left out in turn; light of all slices counted, not of one.)"""
+    depth left out in turn; light of all slices counted, not of one; depths of dark pixels.)"""
     camera = ps.ShiftedLight(lights(2), SENSOR)
     scene = objects(camera)
     shots, truth = record(camera, scene), scene[camera.window]
@@ -60,6 +60,7 @@ def test_a_volume_has_each_object_at_its_depth_and_alike_depths_are_flagged(tmp_
     status, found = called(*asked, listed, "-o", tmp_path / "image")
     assert status == 0 and found["volume_depths_mm"] == [100.5, 200] == found["focus_range_mm"], found
     assert min(found["misfit"]["without_depth"]) > 1.1 and found["depths"]["most_mm"] > 190
+    assert found["depths"]["told_part"] < 0.2, "dark pixels have no depth"
     slices = read_frame(tmp_path / "image" / "volume.exr")[0]
     volume = np.stack([slices["slice_000"], slices["slice_001"]])
     page = ms.report(tmp_path / "image").read_text(encoding="utf-8")
