@@ -170,3 +170,15 @@ def test_pictures_of_a_list_are_checked(tmp_path: Path) -> None:
     (tmp_path / "1.npy").unlink()
     with pytest.raises(ms.MitsimError, match=r"1\.npy: cannot be read"):
         ms.reconstruct_psf(shots, listed)
+
+
+def test_the_preconditioner_of_depths_is_the_inverse_that_is_stated() -> None:
+    """On scenes as large as the grid. (Planted: the shared power twice; another sign.)"""
+    camera = ps.ShiftedLight(lights(2)[:, 12:23, 13:24], (10, 10))
+    assert camera.grid == camera.scene[1:] == (20, 20)
+    scene, light = np.random.default_rng(0).normal(size=camera.scene), np.fft.fft2(camera.psf, camera.grid)
+    seen = np.fft.fft2(scene)
+    bend = 2 - 2 * np.cos(2 * np.pi * np.arange(20) / 20)
+    own = np.square(camera.psf).sum() / 2 + 0.3 + 0.1 * (bend[:, None] + bend + 2)
+    mixed = np.fft.ifft2(own * seen + light.conj() * (light * seen).sum(axis=0)).real
+    np.testing.assert_allclose(camera.preconditioner(0.3, 0.1)(mixed), scene, atol=1e-12)
