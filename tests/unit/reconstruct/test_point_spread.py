@@ -576,6 +576,7 @@ def test_an_image_in_colour_has_the_scene_s_colours_in_the_point_s_light(tmp_pat
         (save(tmp_path / "nan.npy", np.where(light == light.max(), np.nan, light)), "1 values are not finite"),
         (save(tmp_path / "tiny.npy", light[:9]), "needs more than 32 pixels"),
         (tmp_path / "run", "is no file"),
+        (tmp_path / "list.toml", "is coloured, and lists are of one line"),
     ):
         status, text = called("reconstruct", tmp_path / "run", "--psf", psf, "-o", tmp_path / "no")
         assert status == 2 and words in text and not (tmp_path / "no").exists(), text
