@@ -64,6 +64,7 @@ class Reconstructing(ImageRequest, Pictured):
         metavar="FILE|LIST.toml",
     )
     reduce: int = option(1, "only with --psf: average blocks of K x K pixels", min=1, metavar="K")
+    mend_psf: bool = option(False, "only with --psf, under uniform light: first fit scale and rotation to the frame")
     chart: str | None = option(
         None,
         "only for coloured runs: colour chart in the image, to which the colours are fitted; name of a scene, or file",
@@ -81,11 +82,13 @@ class Reconstructing(ImageRequest, Pictured):
             self.check_point_spread(self.reduce)
             if lines.colours and self.psf.suffix.lower() == LIST:
                 raise MitsimError(f"--psf {self.psf}: {run} is coloured, and lists are of one line; give a picture")
+            if self.psf.suffix.lower() == LIST:
+                self.refuse(["mend_psf"], "with a list of point spread functions")
             if not self.psf.is_file():
                 raise MitsimError(f"--psf {self.psf}: is no file; give a picture of the light of a scene point")
             return
-        if self.reduce != 1:
-            self.refuse(["reduce"], "without --psf")
+        if self.reduce != 1 or self.mend_psf:
+            self.refuse(["reduce", "mend_psf"], "without --psf")
         if self.calibration is None:
             raise MitsimError("--calibration: is missing; give the folder of `mitsim calibrate`, or --psf FILE")
         if not lines.colours:
@@ -134,11 +137,12 @@ def reconstruct(asked: Reconstructing) -> int:
         if lines.filters:
             options = {"lam": asked.lam}
         where: Any = {"output": output, "overwrite": asked.overwrite, "job": job, **options}
+        spread: Any = {"reduce": asked.reduce, "mend": asked.mend_psf}
         found: Any
         if asked.psf is not None and lines.colours:
-            found = reconstruct_run.reconstruct_colours(run, asked.psf, reduce=asked.reduce, page=False, **where)
+            found = reconstruct_run.reconstruct_colours(run, asked.psf, page=False, **spread, **where)
         elif asked.psf is not None:
-            found = reconstruct_run.reconstruct_psf(run, asked.psf, reduce=asked.reduce, **where)
+            found = reconstruct_run.reconstruct_psf(run, asked.psf, **spread, **where)
         elif lines.colours:
             found = reconstruct_run.reconstruct_colours(run, calibration, chart=chart, page=False, **where)
         else:

@@ -45,6 +45,8 @@ from typing import Any, Literal
 
 import numpy as np
 from scipy import fft
+from scipy.ndimage import affine_transform, gaussian_filter
+from scipy.optimize import minimize
 
 from mitsim.core.arrays import FloatArray
 from mitsim.core.errors import ArgumentError, MitsimError, check_arguments, cut
@@ -53,11 +55,19 @@ from mitsim.core.images import reduce_frame
 from mitsim.core.job import Cost, Job, Limits
 from mitsim.core.parallel import single_threaded_blas
 from mitsim.core.runs import Capture
+from mitsim.core.seeds import stream
 from mitsim.devices.camera import load_psf
 from mitsim.devices.patterns import PatternFamily
 from mitsim.reconstruct.descent import Array, minimise
 from mitsim.reconstruct.light_list import Lights, blend, load_lights
-from mitsim.reconstruct.reconstruct import POINT_SPREAD, PointSpreadFit, Reconstruction
+from mitsim.reconstruct.reconstruct import (
+    MOST_SCALE,
+    MOST_TURN_DEG,
+    POINT_SPREAD,
+    Mending,
+    PointSpreadFit,
+    Reconstruction,
+)
 from mitsim.reconstruct.request import LIST, TIKHONOV, TV, Bounds, ImageRequest
 from mitsim.reconstruct.solver import Solution, Status, Verdict, check_lambda
 from mitsim.reconstruct.solvers import Prior
@@ -276,7 +286,7 @@ _LIT = 0.05
 """Part of the brightest pixel's light from which a pixel has a depth."""
 _SIDE, _STEPS = 128, 60
 _HALVES = range(-16, 7)
-_TURNED = {"turned by 180 degrees": (-1, -1), "mirrored left to right": (1, -1), "mirrored upside down": (-1, 1)}
+TURNED = {"turned by 180 degrees": (-1, -1), "mirrored left to right": (1, -1), "mirrored upside down": (-1, 1)}
 
 
 def frame_noise(frame: Array) -> float:
@@ -343,13 +353,7 @@ def find_fit(light: ShiftedLight, frames: Array, variance: float | None) -> Poin
     rough, fine = (3.0, 0.3)
     (objective, left), (alternative, chi_square) = cost(small.psf, rough), cost(small.psf, fine)
     rough, objective = (fine, alternative) if left > 4.0 else (rough, objective)
-    others, grid = dict[str, float](), [2 * size for size in small.psf.shape[-2:]]
-    for name, (down, across) in _TURNED.items():
-        copy = small.psf[..., ::down, ::across]
-        shared = (fft.rfft2(small.psf, grid) * fft.rfft2(copy, grid).conj()).reshape(-1, grid[0], grid[1] // 2 + 1)
-        shifted = fft.irfft2(shared.sum(axis=0), grid)
-        if shifted.max() < 0.9 * math.sqrt(float(np.square(small.psf).sum() * np.square(copy).sum())):
-            others[name] = cost(copy, rough)[0]
+    others = {name: cost(copy, rough)[0] for name, copy in other_readings(small.psf).items()}
     reading = min(others, key=lambda name: others[name], default="")
     depths = len(small.psf) if small.deep else 0
     without = [cost(np.delete(small.psf, k, 0), fine)[0] / max(alternative, 1e-300) for k in range(depths)]
@@ -370,6 +374,146 @@ def find_fit(light: ShiftedLight, frames: Array, variance: float | None) -> Poin
         size=(rows, columns),
         without=tuple(without),
     )
+
+
+def other_readings(psf: FloatArray) -> dict[str, FloatArray]:
+    """Return mirrored and rotated copies of ``psf`` that differ from it by more than a shift."""
+    others, grid = dict[str, FloatArray](), [2 * size for size in psf.shape[-2:]]
+    for name, (down, across) in TURNED.items():
+        copy = psf[..., ::down, ::across]
+        shared = (fft.rfft2(psf, grid) * fft.rfft2(copy, grid).conj()).reshape(-1, grid[0], grid[1] // 2 + 1)
+        shifted = fft.irfft2(shared.sum(axis=0), grid)
+        if shifted.max() < 0.9 * math.sqrt(float(np.square(psf).sum() * np.square(copy).sum())):
+            others[name] = copy
+    return others
+
+
+# ---- A wrong light mended --------------------------------------------------------------------------------------------
+# Scale and rotation of a wrong point spread function, fitted to the frame that it shall explain.
+#
+# Minimised over the numbers t is J(t) = min over X >= 0 of 1/2 ||A(t) X - Y||^2 + w TV(X), in which A(t) is the camera
+# whose point spread function is turned and scaled about the middle of its picture (variable projection, Golub and
+# Pereyra, SIAM J. Numer. Anal. 10, 1973): first on a grid with a small frame, then by the simplex of Nelder and Mead. A
+# shift is unknown under uniform light, because it explains the frame as well with an image that is shifted back.
+#
+# **Blur.** Interpolation of light whose lines are as thin as a pixel blurs these lines, except where pixels fall on
+# pixels, so that J depends on t by this as well: the true light cost 0.86 to 0.9 times as much as its interpolation,
+# and fits were off by up to 3 errors. Therefore light and frames are blurred by one Gaussian before the fit (0.99 to 1
+# times), and the frames' edges, which lack light from beyond, are cut off.
+#
+# **Errors.** By the envelope theorem dJ/dt is the sum over pixels of residual times d(A X)/dt. With V its covariance,
+# from sums over blocks of the sensor, and H the second derivatives of J, the covariance of t is H^-1 V H^-1 (Huber
+# 1967), which holds for residuals that are no white noise, too. Regularisation prefers bright small lights. This bias
+# is the fit to simulated frames of the image that was found; it is subtracted. It also counts as an error, because it
+# is too small where the image is smoother than the scene. Rotation of a ring shows nowhere: then J bends more than a
+# fixed image allows, by its iterations' error alone, and the errors are infinite. Errors of the model and false minima
+# change with the blur: a fit with more blur that begins there must stay within the errors.
+
+_SCALES, _TURNS = np.linspace(1 - MOST_SCALE, 1 + MOST_SCALE, 7), np.linspace(-MOST_TURN_DEG, MOST_TURN_DEG, 7)
+_COARSE, _FINE, _SOFT = (48, 24, 0.7), (160, 60, 0.7), (160, 60, 1.4)
+"""Largest shorter side [pixels] of light and frames, steps of each image, and blur [pixels]: grid and two fits."""
+_EVALUATIONS, _BLOCKS = 60, 8
+
+
+def turn(psf: FloatArray, found: Mending) -> FloatArray:
+    """Return ``psf`` (k, k') scaled and rotated as ``found``, with the same sum."""
+    down, across = TURNED.get(found.reading, (1, 1))
+    angle = math.radians(found.rotation_deg)
+    inverse = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]]) / found.scale
+    middle = (np.array(psf.shape) - 1) / 2
+    moved = np.maximum(affine_transform(psf[::down, ::across], inverse, middle - inverse @ middle, order=3), 0.0)
+    return np.asarray(moved * (psf.sum() / max(moved.sum(), 1e-300)))
+
+
+class _Cost:
+    """J of blurred frames (K, m, m') by a ``camera`` under uniform light, averaged over ``factor``^2 pixels."""
+
+    def __init__(self, camera: ShiftedLight, frames: Array, most: int, steps: int, blur: float) -> None:
+        self.steps, (rows, columns) = steps, camera.sensor
+        self.factor = -(-min(*camera.sensor, *camera.psf.shape) // most)
+        self.blur, self.edge, self.size = blur * self.factor, math.ceil(3 * blur) * self.factor, frames.shape
+        self.frames, self.noise = self.soften(frames), math.sqrt(float(np.mean([frame_noise(f) ** 2 for f in frames])))
+        sensor = rows - 2 * self.edge, columns - 2 * self.edge
+        self.camera = replace(camera, psf=gaussian_filter(camera.psf, self.blur, mode="constant"), sensor=sensor)
+        error, given = math.hypot(self.noise / self.factor, 0.01 * float(self.frames.mean())), self.light(Mending())
+        self.prior = Prior(weight=error * math.sqrt(given.column_power), bounds=(0.0, math.inf))
+
+    def soften(self, frames: Array) -> Array:
+        inner = slice(self.edge, -self.edge)
+        blurred = (gaussian_filter(frame, self.blur)[inner, inner] for frame in frames)
+        return np.stack([reduce_frame(frame, self.factor) for frame in blurred])
+
+    def light(self, found: Mending) -> ShiftedLight:
+        turned = replace(self.camera, psf=turn(self.camera.psf, found))
+        return turned.reduce(self.factor) if self.factor > 1 else turned
+
+    def __call__(self, found: Mending) -> float:
+        return minimise(self.light(found), self.frames, self.prior, self.steps, 0.0).objective
+
+    def fit(
+        self, make: Callable[[FloatArray], Mending], start: FloatArray, unit: FloatArray, evaluations: int
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return the two numbers of ``make`` of least J, and their errors; ``unit`` moves light by about a pixel."""
+        simplex = start + unit * np.array([[-0.5, -0.5], [1.0, 0.0], [0.0, 1.0]])
+        options = {"initial_simplex": simplex, "maxfev": evaluations, "xatol": 0.01 * unit.min(), "fatol": 0.0}
+        best = minimize(lambda place: self(make(place)), start, method="Nelder-Mead", options=options).x
+        around = np.array(list(product((-0.5, 0.0, 0.5), repeat=2)))
+        rows, columns = around.T
+        terms = np.stack([np.ones(9), rows, columns, rows**2 / 2, columns**2 / 2, rows * columns], axis=1)
+
+        def parabola() -> FloatArray:
+            costs = [self(make(best + unit * each)) for each in around]
+            return np.asarray(np.linalg.lstsq(terms, costs, rcond=None)[0])
+
+        _, down, across, *bent = parabola()
+        curved = np.array([[bent[0], bent[2]], [bent[2], bent[1]]])
+        light = self.light(make(best))
+        image = minimise(light, self.frames, self.prior, self.steps, 0.0).image
+        residual = light.image_of(image) - self.frames
+        ends = [[self.light(make(best + sign * step)) for sign in (1, -1)] for step in 0.1 * np.diag(unit)]
+        moves = np.stack([after.image_of(image) - before.image_of(image) for after, before in ends]) / 0.2
+        # Images adapt to a change of the light, so that J bends less than squares with a fixed image.
+        most = np.tensordot(moves, moves, axes=((1, 2, 3), (1, 2, 3)))
+        if np.linalg.eigvalsh(curved)[0] <= 0 or np.linalg.eigvalsh(most - curved)[0] <= 0:
+            return best, np.full(2, math.inf)
+        inverse = np.linalg.inv(curved)
+        strips = np.array_split(residual * moves, _BLOCKS, axis=2)
+        tiles = [tile.sum(axis=(1, 2, 3)) for strip in strips for tile in np.array_split(strip, _BLOCKS, axis=3)]
+        noise = self.soften(self.noise * stream(0, "mend").standard_normal(self.size))
+        seen, self.frames = self.frames, np.asarray(residual + self.frames + noise, self.frames.dtype)
+        bias, self.frames = -inverse @ parabola()[1:3], seen
+        moved = np.clip(-inverse @ np.array([down, across]) - bias, -1.0, 1.0)
+        covariance = inverse @ np.cov(np.transpose(tiles)) @ inverse * len(tiles) + np.outer(bias, bias)
+        return best + unit * moved, unit * np.sqrt(np.diag(covariance))
+
+
+def find_mending(camera: ShiftedLight, frames: Array) -> Mending:
+    """Return the change by which the light of ``camera`` explains ``frames`` (1, m, m') best."""
+    if camera.psf.ndim > 2 or camera.patterns is not None:
+        raise MitsimError("only one point spread function and frames under uniform light are mended; leave this out")
+    if (least := min(*camera.sensor, *camera.psf.shape)) < _LEAST_SIDE:
+        raise MitsimError(
+            f"frames and light of {least} pixels a side: at least {_LEAST_SIDE} are needed to mend a light"
+        )
+    if frames.mean() <= 0:
+        raise MitsimError(f"frames of mean {frames.mean():g}: no light can be mended; check exposure and black level")
+    coarse, fine = _Cost(camera, frames, *_COARSE), _Cost(camera, frames, *_FINE)
+    readings = ["", *other_readings(camera.psf)]
+    grid = [Mending(scale, degrees, reading=reading) for reading, scale, degrees in product(readings, _SCALES, _TURNS)]
+    start = min([*sorted(grid, key=coarse)[:5], Mending()], key=fine)
+
+    def turned(place: FloatArray) -> Mending:
+        # A light that shrinks to a point explains every frame by an image as blurred (Levin et al., CVPR 2009).
+        scale = float(np.clip(place[0], 1 - MOST_SCALE, 1 + MOST_SCALE))
+        return replace(start, scale=scale, rotation_deg=float(np.clip(place[1], -MOST_TURN_DEG, MOST_TURN_DEG)))
+
+    # A step moves the edge of the light by one pixel.
+    unit = 2 / max(camera.psf.shape) * np.array([1.0, math.degrees(1.0)])
+    place, errors = fine.fit(turned, np.array([start.scale, start.rotation_deg]), unit * fine.factor, _EVALUATIONS)
+    soft = _Cost(camera, frames, *_SOFT).fit(turned, place, unit * fine.factor, 1)
+    far = float(np.max(np.abs(place - soft[0]) / np.maximum(np.hypot(errors, soft[1]), 1e-300)))
+    found = replace(turned(place), scale_error=float(errors[0]), rotation_error=float(errors[1]))
+    return replace(found, cost=fine(found) / fine(Mending()), apart=far if np.isfinite(soft[1]).all() else math.inf)
 
 
 # ---- The image -------------------------------------------------------------------------------------------------------
@@ -430,6 +574,7 @@ def reconstruct_psf(
     method: str = TIKHONOV,
     bounds: Bounds | None = None,
     iterations: int | None = None,
+    mend: bool = False,
 ) -> Reconstruction:
     """Recover the image of a camera whose scene points all cast one pattern of light, each shifted by its place.
 
@@ -455,6 +600,8 @@ def reconstruct_psf(
         Least and largest number of the image [electrons/s], for ``nonnegative`` and ``tv``; None: 0 and inf.
     iterations
         Largest number of steps, for ``nonnegative`` and ``tv``; None: 300.
+    mend
+        Fit scale, rotation and orientation of the point spread function to the frame first, under uniform light.
 
     Raises
     ------
@@ -462,15 +609,23 @@ def reconstruct_psf(
         For a picture without light, frames that do not fit, too little memory, and another lambda, method or bounds.
     """
     asked = ImageRequest(lam=lam, method=method, bounds=bounds, iterations=iterations)
-    return reconstruct_psf_request(shots, psf, reduce, asked)
+    return reconstruct_psf_request(shots, psf, reduce, asked, mend=mend)
 
 
 @single_threaded_blas()
 def reconstruct_psf_request(
-    shots: Capture, psf: Path | str | FloatArray | Lights, reduce: int, request: ImageRequest, job: Job | None = None
+    shots: Capture,
+    psf: Path | str | FloatArray | Lights,
+    reduce: int,
+    request: ImageRequest,
+    job: Job | None = None,
+    mend: bool = False,
 ) -> Reconstruction:
     request.check_point_spread(reduce)
-    return SeenFrames(shots, lights_of(psf, reduce), reduce, job).image(request, request.lam)
+    seen = SeenFrames(shots, lights_of(psf, reduce), reduce, job)
+    if mend:
+        seen.mend()
+    return seen.image(request, request.lam)
 
 
 class SeenFrames:
@@ -501,13 +656,22 @@ class SeenFrames:
                 variance += float(np.mean(np.maximum(digital.variance(each.light, each.shots), 0.0)))
         self._variance = variance / reduce**2 / camera.count if digital.noise_is_stated else None
         self.camera, self.frames = camera, frames
+        self._mended: Mending | None = None
+
+    def mend(self, known: Mending | None = None) -> Mending:
+        """Change the light as the frames, or those of another line, show; return the change."""
+        with self._clock.stage("mend"):
+            self._mended = found = known or find_mending(self.camera, self.frames)
+            if found.is_better:
+                self.camera = replace(self.camera, psf=turn(self.camera.psf, found))
+        return found
 
     def image(self, request: ImageRequest, lam: float | Literal["auto"]) -> Reconstruction:
         """Return the image with ``lam``, which may be that of several lines."""
         with self._clock.stage("solve"):
             solution = solve_point_spread(self.camera, self.frames, request.name, lam, **request.iterative)
         with self._clock.stage("misfit"):
-            fit = find_fit(self.camera, self.frames, self._variance)
+            fit = replace(find_fit(self.camera, self.frames, self._variance), mended=self._mended)
         status, focus, depths, doubt = fit.judge(solution.status), None, self.lights.depths_mm, self.lights.doubt
         if depths is not None:
             slices, energy = solution.image, float(np.square(self.frames, dtype=np.float64).sum())
@@ -526,17 +690,19 @@ class SeenFrames:
             fit=fit,
             focus=focus,
             seconds={stage: spent for stage, spent in self._clock.seconds().items() if stage != "total"},
-            inputs=psf_inputs(self.shots, self.lights, self.reduce, request),
+            inputs=psf_inputs(self.shots, self.lights, self.reduce, request, self._mended is not None),
         )
 
 
-def psf_inputs(shots: Capture, lights: Lights, reduce: int, request: ImageRequest) -> dict[str, Any]:
+def psf_inputs(
+    shots: Capture, lights: Lights, reduce: int, request: ImageRequest, mend: bool = False
+) -> dict[str, Any]:
     digest = hashlib.sha256(f"{lights.light.shape}".encode() + np.ascontiguousarray(lights.light).tobytes())
     for where in (lights.depths_mm, lights.places):
         digest.update(b"" if where is None else f"{where.shape}".encode() + where.tobytes())
     asked = {"run": shots.fingerprint, POINT_SPREAD: digest.hexdigest(), "reduce": reduce, "lambda": request.lam}
     asked["method"] = request.method
-    return {**asked, **request.plain}
+    return {**asked, **request.plain, **({"mend": True} if mend else {})}
 
 
 def lights_of(psf: Path | str | FloatArray | Lights, reduce: int) -> Lights:

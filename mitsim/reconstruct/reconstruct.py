@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -38,11 +39,60 @@ if TYPE_CHECKING:
 
 _TURNED, _EQUAL = 0.85, 0.98
 """Cost ratios of the best turned copy below which it is recommended, and below which the light is wrong."""
+MOST_SCALE, MOST_TURN_DEG = 0.1, 6.0
+"""Largest change of scale, and rotation [degrees], that the mending of a point spread function looks for."""
+_APART = 3.0
+"""Standard errors by which two fits differ at most, and those of a change that is used at least."""
 _LEAST_GAIN, _RISE, _NOISY = 1.015, 0.02, 1.2
 """Least cost ratio of right light: the first times chi-square to the second; noise explains frames below the last."""
 _NEEDED, _SHARE = 1.1, 0.1
 """Least cost ratio without a depth that has at least that share of the light. Of 30 simulated volumes above it 66 to
 82 % of the light was at the right depth, and below 33 to 57 %, or up to 84 % where a depth of the list was empty."""
+
+
+@dataclass(frozen=True)
+class Mending:
+    """Change of a point spread function: ``scale`` and ``rotation_deg`` (columns towards rows) about its middle.
+
+    The copy named ``reading`` is changed so.
+    ``cost`` is that of the changed function over that of the given one. Errors are standard errors; fits to less and
+    to more blurred frames are ``apart`` by so many of them.
+    """
+
+    scale: float = 1.0
+    rotation_deg: float = 0.0
+    reading: str = ""
+    scale_error: float = 0.0
+    rotation_error: float = 0.0
+    cost: float = 1.0
+    apart: float = 0.0
+
+    @property
+    def is_better(self) -> bool:
+        """Return True if the frames show a change, by more than three standard errors."""
+        return not self.fault[0]
+
+    @property
+    def fault(self) -> tuple[str, str]:
+        errors = self.scale_error, self.rotation_error
+        far = math.hypot((self.scale - 1) / max(errors[0], 1e-12), self.rotation_deg / max(errors[1], 1e-12))
+        if abs(self.scale - 1) >= MOST_SCALE or abs(self.rotation_deg) >= MOST_TURN_DEG:
+            why = f"the best fit is at the end of the search, {MOST_SCALE:.0%} of scale or {MOST_TURN_DEG:g} degrees"
+        elif (
+            self.cost >= 1 or not all(map(math.isfinite, (*errors, self.apart))) or (far < _APART and not self.reading)
+        ):
+            why = "no scale or rotation explains the frames better"
+        elif self.apart > _APART:
+            why = f"fits to less and to more blurred frames are {self.apart:.1f} standard errors apart"
+        else:
+            return "", ""
+        return f"Not mended: {why}; the light is used as given", "use the light of one point as this camera sees it"
+
+    def __str__(self) -> str:
+        turned = f"{self.reading}, " if self.reading else ""
+        words = f"{turned}scale {self.scale:.4f} ± {self.scale_error:.4f}, "
+        words += f"rotation {self.rotation_deg:.2f} ± {self.rotation_error:.2f} degrees"
+        return f"mended light: {words}; it costs {self.cost:.2g} times as much as the light as given"
 
 
 @dataclass(frozen=True)
@@ -62,6 +112,7 @@ class PointSpreadFit:
     off: tuple[float, float]
     size: tuple[int, int]
     without: tuple[float, ...] = ()
+    mended: Mending | None = None
 
     @property
     def fault(self) -> tuple[str, str]:
@@ -86,12 +137,14 @@ class PointSpreadFit:
 
     @property
     def gist(self) -> str:
-        return f"{self.unexplained:.1%} unexplained"
+        return f"{self.unexplained:.1%} unexplained" + (f"; {self.mended}" if self.mended else "")
 
     def __str__(self) -> str:
         noise = "its stated noise" if self.stated else "noise, measured from the frames"
         cost = "" if self.gain is None else f"; turned or mirrored, the light costs {self.gain:.3g} times as much"
-        return f"misfit: {self.unexplained:.1e} unexplained, chi-square {self.chi_square:.3g} against {noise}{cost}"
+        mended = f"; {self.mended}" if self.mended else ""
+        chi_square = f"chi-square {self.chi_square:.3g} against {noise}"
+        return f"misfit: {self.unexplained:.1e} unexplained, {chi_square}{cost}{mended}"
 
     def summary(self) -> dict[str, Any]:
         sentence, _ = self.fault
@@ -104,6 +157,7 @@ class PointSpreadFit:
             "reading": self.reading if self.gain is not None and self.gain < _TURNED else None,
             "off_centre": list(self.off),
             "without_depth": list(self.without) or None,
+            "mended": self.mended and asdict(self.mended),
         }
 
     def doubt_of(self, slices: FloatArray, depths_mm: FloatArray) -> str:
@@ -121,6 +175,8 @@ class PointSpreadFit:
 
     def judge(self, status: Status) -> Status:
         sentence, remedy = self.fault
+        if not sentence and self.mended:
+            sentence, remedy = self.mended.fault
         return status.with_misfit(sentence, remedy) if sentence else status
 
 

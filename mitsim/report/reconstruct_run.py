@@ -87,21 +87,28 @@ def reconstruct(
 
 
 def reconstruct_psf(
-    run: Path, psf: Path, output: Path, reduce: int = 1, overwrite: bool = False, job: Job | None = None, **options: Any
+    run: Path,
+    psf: Path,
+    output: Path,
+    reduce: int = 1,
+    mend: bool = False,
+    overwrite: bool = False,
+    job: Job | None = None,
+    **options: Any,
 ) -> Judged:
     """Recover the image of a run with a measured point spread function, and write the files of :func:`reconstruct`.
 
-    ``reduce`` x ``reduce`` pixels of frames and ``psf`` become one. The ``options`` are ``lam``, ``method``, ``bounds``
-    and ``iterations``.
+    ``reduce`` x ``reduce`` pixels of frames and ``psf`` become one. ``mend`` and the ``options`` ``lam``, ``method``,
+    ``bounds`` and ``iterations`` are those of :func:`mitsim.reconstruct_psf`.
     """
     from mitsim.reconstruct.point_spread import lights_of, psf_inputs, reconstruct_psf_request
 
     request = ImageRequest(**options)
     request.check_point_spread(reduce)
     shots, lights = load_run(run), lights_of(psf, reduce)
-    replaces = may_replace(output, psf_inputs(shots, lights, reduce, request), overwrite)
+    replaces = may_replace(output, psf_inputs(shots, lights, reduce, request, mend), overwrite)
     with output_folder(output, overwrite=replaces) as folder:
-        judged = Judged(reconstruct_psf_request(shots, lights, reduce, request, job), None, str(folder))
+        judged = Judged(reconstruct_psf_request(shots, lights, reduce, request, job, mend), None, str(folder))
         judged.reconstruction.write(folder, {**judged.summary(), **_origin(job, run)})
     return judged
 
@@ -124,6 +131,7 @@ def reconstruct_colours(
     job: Job | None = None,
     page: bool = True,
     reduce: int = 1,
+    mend: bool = False,
     **options: Any,
 ) -> ColourImage:
     """Recover the image of every line of a coloured run, and combine them to one image in colour.
@@ -148,6 +156,8 @@ def reconstruct_colours(
         False to leave out pictures and report.html, which :func:`mitsim.report` makes later.
     reduce
         Pixels a side that become one, by a point spread function.
+    mend
+        Whether the point spread function is fitted to the frames of the middle line first, and changed for all alike.
     **options
         Options of :func:`mitsim.reconstruct`, for every line; of a run behind colour filters, ``lam`` alone; by a point
         spread function those of :func:`mitsim.reconstruct_psf`.
@@ -181,7 +191,7 @@ def reconstruct_colours(
         return image
 
     if by_point:
-        image = _solve_by_point(lines, run, calibration, output, reduce, overwrite, job, finish, **options)
+        image = _solve_by_point(lines, run, calibration, output, reduce, mend, overwrite, job, finish, **options)
     elif found.filters:
         for name in options.keys() - {"lam"}:
             raise ArgumentError(name, "has no effect behind colour filters; leave it out")
@@ -239,6 +249,7 @@ def _solve_by_point(
     psf: Path,
     output: Path,
     reduce: int,
+    mend: bool,
     overwrite: bool,
     job: Job,
     finish: Callable[..., ColourImage],
@@ -255,7 +266,7 @@ def _solve_by_point(
     (rows, columns), how = first.summary()["shape"], first.manifest.configuration.get("prepare")
     light = load_psf_channels(psf, lines.names, (rows, columns), how if isinstance(how, dict) else {}, reduce)
     totals = light.sum(axis=(1, 2))
-    inputs = psf_inputs(first, Lights(light), reduce, request)
+    inputs = psf_inputs(first, Lights(light), reduce, request, mend)
     inputs["run"] = "-".join(each.fingerprint for each in shots.values())
     replaces = colour_files.is_coloured(output)
     if replaces and not overwrite:
@@ -267,6 +278,10 @@ def _solve_by_point(
             name: SeenFrames(each, Lights(channel), reduce, job.apart(f"{name} "))
             for (name, each), channel in zip(shots.items(), channels, strict=True)
         }
+        if mend:
+            found = list(seen.values())[len(seen) // 2].mend()
+            for each in seen.values():
+                each.mend(found)
         lam = request.lam
         if lam == "auto":
             weights = [automatic_weight(each.camera, each.frames, request.name) for each in seen.values()]

@@ -6,6 +6,7 @@ A camera's matrix is made here from its definition, pixel by pixel, without a tr
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,7 @@ from mitsim.devices.camera import load_psf_channels
 from mitsim.devices.patterns import parse_patterns
 from mitsim.exchange.formats import import_frames
 from mitsim.reconstruct import point_spread as ps
+from mitsim.reconstruct.reconstruct import Mending
 from mitsim.reconstruct.solver import Verdict
 from mitsim.reconstruct.solvers import Prior
 from tests.unit.reconstruct.test_tv import SIZE, smoothed_minimum
@@ -612,3 +614,112 @@ def save_png(path: Path, values: np.ndarray) -> Path:
 def save(path: Path, values: np.ndarray) -> Path:
     np.save(path, values)
     return path
+
+
+# ---- A wrong point spread function mended ----------------------------------------------------------------------------
+
+TRUTH = Mending(1.03, 1.5)
+UNPROVEN = [("apart", 3.1), ("apart", INF), ("cost", 1.0), ("scale", 1.1), ("rotation_error", INF)]
+
+
+def thin_lines() -> tuple[ps.ShiftedLight, np.ndarray, np.ndarray]:
+    """Camera of a light of lines as thin as a pixel, and a frame by the light changed by TRUTH, and this light."""
+    rng, fine = np.random.default_rng(1), 4
+    row, column = (np.indices((40 * fine, 40 * fine)) - 20 * fine + 0.5) / fine
+    drawn = np.exp(-(((row**2 + column**2) / 12**2) ** 3)) * sum(
+        np.exp(-np.square((np.cos(angle) * row + np.sin(angle) * column - off) / 0.35))
+        for angle, off in zip(rng.uniform(0, np.pi, 9), rng.uniform(-10, 10, 9), strict=True)
+    )
+    given, changed = (
+        each.reshape(40, fine, 40, fine).sum(axis=(1, 3)) / each.sum() for each in (drawn, ps.turn(drawn, TRUTH))
+    )
+    camera = ps.ShiftedLight(changed, (56, 56))
+    scene = np.zeros(camera.scene)
+    for _ in range(40):
+        top, left, down, across = (*rng.integers(0, camera.scene), *rng.integers(4, 14, 2))
+        scene[top : top + down, left : left + across] = rng.random() ** 2
+    frames = camera.image_of(gaussian_filter(scene, 0.7))
+    frames += 0.003 * frames.mean() * rng.normal(size=frames.shape)
+    return replace(camera, psf=given, precision=np.float32), frames.astype(np.float32), changed
+
+
+def test_a_point_right_of_the_middle_turns_downwards_and_away() -> None:
+    """(Planted: rotation the other way; no scale.)"""
+    row, column = np.indices((41, 41)) - 20
+    moved = ps.turn(np.exp(-(row**2 + (column - 10) ** 2) / 4.0), Mending(1.1, 6.0))
+    centre = [np.average(place, weights=moved) for place in (row, column)]
+    turned = np.radians(6.0)
+    assert centre == pytest.approx([11 * np.sin(turned), 11 * np.cos(turned)], abs=1e-3)
+
+
+def test_a_wrong_light_of_thin_lines_is_mended_within_its_errors(monkeypatch: pytest.MonkeyPatch) -> None:
+    """(Planted: no blur, a blur of the frame alone, no mirrored copies, a fit compared with itself.)"""
+    quick = {"_SCALES": np.array([0.97, 1.03]), "_TURNS": np.array([-2.0, 2.0]), "_EVALUATIONS": 20}
+    for name, value in quick.items():
+        monkeypatch.setattr(ps, name, value)
+    camera, frames, changed = thin_lines()
+    cost, right = (ps._Cost(replace(camera, psf=psf), frames, *ps._FINE) for psf in (camera.psf, changed))
+    right.prior = cost.prior
+    assert right(Mending()) > 0.98 * cost(TRUTH)
+    found = ps.find_mending(replace(camera, psf=np.ascontiguousarray(camera.psf[:, ::-1])), frames)
+    assert found.reading == "mirrored left to right" and found.is_better, found
+    assert found.cost < 0.8 and 0 < found.apart < 3
+    pairs = [(found.scale - TRUTH.scale, found.scale_error, 0.03)]
+    pairs.append((found.rotation_deg - TRUTH.rotation_deg, found.rotation_error, 0.7))
+    for off, error, most in pairs:
+        assert abs(off) < 2.5 * error and 0 < error < most, found
+    with pytest.raises(MitsimError, match="check exposure"):
+        ps.find_mending(camera, 0 * frames)
+    with pytest.raises(MitsimError, match="under uniform light are mended"):
+        ps.find_mending(ps.ShiftedLight(camera.psf, (56, 56), dots(30, 30, 3)), frames)
+
+
+def test_rotation_of_a_ring_has_no_finite_error() -> None:
+    """(Planted: curvature beyond that of a fixed image trusted.)"""
+    row, column = np.indices((40, 40)) - 19.5
+    camera = ps.ShiftedLight(np.exp(-np.square((np.hypot(row, column) - 8) / 1.5)), (56, 56), None, np.float32)
+    scene = np.zeros(camera.scene)
+    scene[30:60, 20:50] = 1.0
+    frames = camera.image_of(scene)
+    frames += np.random.default_rng(1).normal(0, 0.01 * frames.mean(), frames.shape)
+    cost = ps._Cost(camera, frames.astype(np.float32), *ps._FINE)
+    _, errors = cost.fit(lambda place: Mending(place[0], place[1]), np.array([1.0, 2.0]), np.array([0.05, 2.9]), 1)
+    assert not np.isfinite(errors).any()
+
+
+def test_the_image_is_that_of_the_mended_light_if_the_fit_is_proven(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """(Planted: every change applied, none applied, a list let pass.)"""
+    camera, frames, _ = thin_lines()
+    (tmp_path / "camera.toml").write_text(CAMERA)
+    facts = {"camera": tmp_path / "camera.toml", "exposure": 1.0, "patterns": "uniform", "projector_pixels": 8}
+    dn = np.rint(20000 * np.maximum(frames[0] / frames.max(), 0) + 10).astype(np.uint16)
+    import_frames(save(tmp_path / "shot.npy", dn), tmp_path / "run", **facts)
+    fit = replace(TRUTH, scale_error=0.001, rotation_error=0.1, cost=0.5)
+    unproven = [replace(fit, **{name: value}) for name, value in UNPROVEN]
+    vague = replace(fit, scale_error=0.1, rotation_error=1.0)
+    assert not any(each.is_better for each in [*unproven, vague]) and replace(vague, reading="mirrored").is_better
+    psf, right = save(tmp_path / "given.npy", camera.psf), save(tmp_path / "right.npy", ps.turn(camera.psf, fit))
+    images, asked = {}, ("reconstruct", tmp_path / "run", "--method", "tv", "-o")
+    for name, light, mended in (
+        ("right", right, None),
+        ("given", psf, None),
+        ("yes", psf, fit),
+        ("no", psf, unproven[0]),
+    ):
+        monkeypatch.setattr(ps, "find_mending", lambda *_, mended=mended: mended)
+        status, found = called(*asked, tmp_path / name, "--psf", light, *(["--mend-psf"] if mended else []))
+        assert status < 2, found
+        images[name] = read_frame(tmp_path / name / "image.exr")[0]["reflectance"]
+        assert ("3.1 standard errors apart" in found["status"]) == (name == "no") == (mended is unproven[0]), found
+        assert (found["misfit"]["mended"] or {}).get("scale") == (mended and 1.03)
+
+    def off(one: np.ndarray, other: np.ndarray) -> float:
+        return float(np.linalg.norm(one - other) / np.linalg.norm(other))
+
+    assert np.array_equal(images["no"], images["given"]) and off(images["yes"], images["right"]) < 0.05
+    assert off(images["given"], images["right"]) > 0.1
+    for more, why in (("--calibration", "without --psf"), ("--psf", "with a list of point")):
+        status, text = called(*asked, tmp_path / "refused", more, tmp_path / "lights.toml", "--mend-psf")
+        assert status == 2 and f"has no effect {why}" in text
