@@ -139,7 +139,6 @@ class Working(Options):
 
 
 def _check_range(name: str, value: float, least: float, most: float, rule: str) -> float:
-    """Return ``value``, or raise ArgumentError with the ``rule``, in which {} stands for the range."""
     if not least <= value <= most:
         raise ArgumentError(name, f"{value}: give {rule.format(f'{least:g} to {most:g}')}")
     return value
@@ -164,7 +163,6 @@ def check_samples(estimator: str, spp: int | None) -> None:
 
 
 def _switches(effects: object) -> dict[str, bool]:
-    """Return effects that are switched on or off, by name; MitsimError for anything else."""
     if isinstance(effects, Mapping) and all(isinstance(value, bool) for value in effects.values()):
         effects = ",".join(f"{'+' if on else '-'}{name}" for name, on in effects.items())
     if not isinstance(effects, str):
@@ -333,7 +331,6 @@ def by_line(colour: str) -> bool:
 
 
 def _parameters(texts: Iterable[str]) -> dict[str, Any]:
-    """Return the scene's parameters that are written NAME=VALUE."""
     parameters = {}
     for text in texts:
         name, equals, value = text.partition("=")
@@ -428,7 +425,6 @@ class Opening(LitScene):
 
 
 def _known_colour(colour: str) -> None:
-    """Refuse a word of ``colour`` that is not known."""
     if colour.startswith(f"{BANDS}:"):
         bands_of(colour)
     elif colour not in (NO, LINES, MOSAIC):

@@ -439,7 +439,6 @@ def _kernel_lines(kernels: Mapping[str, float]) -> list[str]:
 
 
 def _capture_lines(payload: Mapping[str, Any], common: Common) -> list[str]:
-    """Return the lines of a capture for the terminal, by its ``payload``."""
     taken = payload["seconds"]
     lines = [f"Run: {payload['output']} (in {taken['total']:.1f} s)"]
     if payload.get("kind") == RUN:

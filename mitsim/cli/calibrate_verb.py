@@ -86,7 +86,6 @@ def _finish(found: Mapping[str, Factors], folder: Path, asked: Calibrating, memo
 
 
 def _simulated(asked: Calibrating, folder: Path) -> int:
-    """Calibrate by a simulated session."""
     recipe, colour, kept = asked.recipe or load_recipe(), asked.colour, asked.write_frames
     if kept is not None or colour != NO:
         recipe.of_one_depth()
@@ -110,7 +109,6 @@ def _simulated(asked: Calibrating, folder: Path) -> int:
 
 
 def _frames(asked: Calibrating, folder: Path) -> int:
-    """Calibrate by the frames of a real session."""
     session = load_frames(Path(str(asked.frames)))  # refused before the estimator is imported
     from mitsim.reconstruct.captured_session import calibrate_frames, calibrate_planes
 
@@ -124,7 +122,6 @@ def _frames(asked: Calibrating, folder: Path) -> int:
 
 
 def _known(asked: Calibrating, folder: Path) -> int:
-    """Calibrate by captures of known pictures."""
     captures = load_known(Path(str(asked.known)))  # refused before the fit is imported
     check_output(folder)
     from mitsim.reconstruct.known_pictures import calibrate_known
@@ -158,7 +155,6 @@ def _known(asked: Calibrating, folder: Path) -> int:
 
 
 def _plan(asked: Calibrating, _: Path) -> int:
-    """Plan a session that an image of a given PSNR needs."""
     if asked.scene is None or asked.psnr is None:
         raise MitsimError("--plan-session: give a scene, and the PSNR that the image is to reach, such as --psnr 35")
     recipe, output = asked.recipe or load_recipe(), asked.output
@@ -182,7 +178,6 @@ def _plan(asked: Calibrating, _: Path) -> int:
 
 
 def _fit(asked: Calibrating, folder: Path) -> int:
-    """Model the factors, with devices that are fitted to a few frames."""
     fitted = FITTED if asked.fit is None else tuple(name.strip() for name in asked.fit.split(","))
     count = {} if asked.frames_used is None else {"frames": asked.frames_used}
     model: Any = asked.model  # checked there

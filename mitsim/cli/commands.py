@@ -408,7 +408,6 @@ def help_of(text: str | None) -> str:
 
 
 def _write_panels(formatter: Any, rows: Iterable[tuple[str, Any]]) -> None:
-    """Write rows of names and meanings under their headings."""
     panels = dict[str, list[Any]]()
     for heading, row in rows:
         panels.setdefault(heading, []).append(row)

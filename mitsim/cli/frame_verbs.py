@@ -153,7 +153,6 @@ def reconstruct(asked: Reconstructing) -> int:
 
 
 def _image_lines(result: Judged, payload: dict[str, Any], common: Pictured) -> list[str]:
-    """Return the lines of an image for the terminal, by its ``payload``."""
     image, rank = result.reconstruction, payload["rank"]
     rank_words = "" if rank is None else f", rank {rank}, condition {payload['condition_whole']:.3g}"
     quality = str(result.quality or "").partition(", ")[2]  # its PSNR is in the headline
@@ -176,7 +175,6 @@ def _image_lines(result: Judged, payload: dict[str, Any], common: Pictured) -> l
 
 
 def _colours_lines(found: ColourImage, common: Pictured) -> list[str]:
-    """Return the lines of an image in colour for the terminal."""
     return [
         f"Image: {found.output}",
         *(f"{name}: {row}" for name, row in found.table.items()),

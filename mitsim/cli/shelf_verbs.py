@@ -215,7 +215,6 @@ _STARTERS = {
 
 
 def _shipped(kind: str) -> Mapping[str, Path]:
-    """Return the files that one of a ``kind`` may be like, by name."""
     if field := _STARTERS[kind].field:
         return configuration.shipped_files("calibration", ".toml", field)
     if kind == "scene":

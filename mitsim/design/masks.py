@@ -113,7 +113,6 @@ class Candidate:
 
 
 def _camera(bench: Apparatus, **update: Any) -> CameraGeometry:
-    """Return the camera of a bench with a thin separable mask in place of its own."""
     bare = {"mask": "separable", "mask_plate": None, "mask_thickness": 0.0, **update}
     return validate(CameraGeometry, {**dict(bench.geometry), **bare}, "goal")
 
@@ -349,7 +348,6 @@ def sensitivity(stand: Stand, goal: Goal, choice: Choice, search: Search, code: 
 
 
 def _score(search: Search, code: FloatArray, longer: float) -> float:
-    """Return the score of a code for exposures that are ``longer`` by a factor."""
     changed = [replace(one, light=replace(one.light, frame_s=one.light.frame_s * longer)) for one in search.objectives]
     return Search(changed, search.open_part, search.worst, search.seed).score(code).score
 

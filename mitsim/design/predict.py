@@ -93,7 +93,6 @@ class TracedLight:
 
 
 def _before(directions: Directions, window: tuple[float, float]) -> int:
-    """Return the cells before the ``window``."""
     return round((window[0] - float(directions.centres[0])) / directions.width + 0.5)
 
 

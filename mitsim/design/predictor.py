@@ -273,7 +273,6 @@ class Predictor:
 
     @cached_property
     def _moments(self) -> dict[tuple[int, int], FloatArray]:
-        """Return the expected products (r, r') of all pairs of data."""
         full = self._data_of(self.camera.terms)
         seen = full if self.seen is None else self.seen
         left, right = (self._in_cells(side.basis.T) for side in self._sides)
@@ -311,7 +310,6 @@ class Predictor:
 
     @cached_property
     def _variances(self) -> dict[str, FloatArray]:
-        """Return the variance (r, r') of W by each source."""
         noise, sigma, sides, shots = self.noise, self.prepared.sigma, self._sides, 2 if self.signed else 1
         rows, columns = self.light
         found = {
@@ -368,7 +366,6 @@ class Predictor:
 
     @property
     def _energy(self) -> float:
-        """Return the expected energy of the scene by pixels."""
         left, right = (self._in_cells(np.eye(side.scene_size)) for side in self._sides)
         return float(self._expected([(left, right)], [(left, right)]).sum())
 

@@ -93,7 +93,6 @@ Look = tuple[tuple[str, int, int], ...]
 
 
 def _look(path: Path) -> Look:
-    """Return names, times and sizes of the files at a ``path``, in the order of their patterns."""
     if path.suffix.lower() not in ENDINGS and not path.is_dir():
         check_plain(path, "patterns")
         raise MitsimError(f"patterns {path}: give {OWN}")

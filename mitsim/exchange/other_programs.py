@@ -252,7 +252,6 @@ def _sensor_places(camera: Mapping[str, Any], shape: tuple[int, ...]) -> Labels:
 
 
 def _scene_places(factors: Factors) -> Labels:
-    """Return the centres of scene pixels on the calibrated plane [mm], if known."""
     parallax, found = factors.manifest.parallax, Labels()
     if parallax is None:
         return found

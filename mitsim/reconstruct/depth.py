@@ -15,11 +15,8 @@ pixel's step makes up for. So a cubic spline with knots finer than columns is fi
 true depth, and others where dots of period k see their neighbours' light. So every valley that may be the lowest is
 followed to its bottom, and valleys that chance or the model's misfit may have raised are reported as alternatives.
 
-*A depth for each pixel.* Every frame is first reconstructed at the calibrated depth as if all pixels along the
-baseline were lit, which shows where each dot's light arrives. Then two depths beside that of each pixel state slope and
-curvature of the energy that it explains; pooled over neighbours they give a step. At the end pixels take the depth of a
-neighbour where that explains more, which makes edges sharp. Depths whose parallax spans more than a period of the dots
-are ambiguous.
+*A depth for each pixel.* See docs/reconstruction.md. At the end pixels take the depth of a neighbour where that
+explains more, which makes edges sharp.
 """
 
 from __future__ import annotations

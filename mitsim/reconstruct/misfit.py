@@ -9,25 +9,9 @@ of the data that restore the fit. Four measurements decide, in this order:
 3. Frames: each frame against the prediction of the others (:class:`FrameCheck`).
 4. Readings, if one of the first three fails: turned frames and shots in another order.
 
-*Defective pixels.* A defective pixel is off in every frame, and its neighbours are not. A separable solver cannot
-weigh single pixels, so their readings are replaced by the prediction from all others: setting y - r / (1 - h) at a
-datum of leverage h leaves an image as if it had not been measured. Pixels that share frames are set in rounds.
-
-*Frames.* Where patterns overlap, the other frames predict a frame by the model: e^T (I - H_kk)^-1 e is the energy of
-the difference, in closed form. The halves of every signed pattern add up to the same light. A closing frame repeats the
-first pattern, or all pixels lit, at the end of the session.
-
-*Picture.* Under shifting dots every scene pixel is in one frame only. Therefore a frame from another scene, or one that
-was taken after lamp or camera changed, fits the model as well as a right frame. The only redundancy is the picture: a
-symmetric stencil of neighbours, fitted to the run itself, predicts each pixel from other frames. Three measurements use
-the differences r between pixels and predictions:
-
-1. the mean of log(1 + u^2) over a frame, u being r over its robust scale, detects a foreign frame;
-2. least squares estimate the power and then the shift of all frames, because a frame of power 1 + a adds a X at its
-   own pixels and changes the predictions of its neighbours;
-3. the mean of 1 over windows of a few dots and one to four consecutive shots detects a hand in a few frames.
-
-If power and place of single frames remain undecided, their standard errors are stated.
+docs/reconstruction.md explains the checks of frames, and of pictures under shifting dots, whose frames share no pixel.
+Readings of defective pixels are replaced by the prediction from all others: y - r / (1 - h) at a datum of residual r
+and leverage h leaves an image as if it had not been measured. Pixels that share frames are set in rounds.
 """
 
 from __future__ import annotations

@@ -3,15 +3,11 @@
 A diffuser before a bare sensor casts one pattern of light h from every scene point, shifted by its place (Antipa et
 al., Optica 5, 1, 2018). One scene pixel shifts h by one sensor pixel. Under the pattern P_i (arXiv 2111.12862, section
 "Coded Illumination with Nonseparable Systems") the frame is Y_i = crop(h * (P_i o X)). Minimised over all X within
-bounds is
+bounds (:mod:`mitsim.reconstruct.descent`) is
 
-    P(X) = 1/2 sum_i ||Y_i - crop(h * (P_i o X))||^2 + weight TV(X) + ridge / 2 ||X||^2
+    P(X) = 1/2 sum_i ||Y_i - crop(h * (P_i o X))||^2 + weight TV(X) + ridge / 2 ||X||^2 .
 
-**Scene.** Under uniform light the scene is everything that can put light on the sensor: frames of m pixels and h of k
-have m + k - 1 scene pixels a side. The image is its middle, as large as the sensor. Under patterns the scene is
-theirs, and dark beyond.
-
-**Method.** The objective is minimised by :mod:`mitsim.reconstruct.descent`.
+docs/convolutional.md states the size of the scene, the automatic weight and the check of the fit.
 
 **Dots.** Under dots of period k no pixel is in two frames, so that the normal equations fall into k^2 independent
 systems, one for the n^2/k^2 pixels of each *class* that shines together, as in the paper's equation 8. Where the sensor
@@ -20,16 +16,6 @@ gets all light, the matrix of a class is a section of one convolution with h's a
     G[p, p'] = sum over sensor pixels s of h[s - p] h[s - p'],       p - p' a multiple of k,
 
 and is solved on grids of 2n/k pixels a side.
-
-**Weight.** Blocks of sensor pixels are held out and predicted from the image of the rest. Where the best lambda asks
-for clearly more noise than the frames have, the weight follows from that model error in place of the noise.
-
-**Fit.** Any point spread function fits a frame with some image, because the scene has more pixels, but a wrong one
-needs a negative or rough image. So the least of
-
-    1/2 ||A X - Y||^2 + w TV(X),    X >= 0
-
-is compared with that of the same light mirrored and turned, which has the same spectrum.
 """
 
 from __future__ import annotations

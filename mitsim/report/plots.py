@@ -277,7 +277,6 @@ def save_figure(figure: Figure, path: Path | str) -> None:
 
 
 def _drawn(draw: Callable[..., Axes]) -> Callable[..., Axes]:
-    """Give a function that draws on axes the options :class:`mitsim.core.configuration.Drawn`."""
 
     @wraps(draw)
     def call(*arguments: Any, **options: Any) -> Axes:

@@ -610,7 +610,6 @@ def with_own_files(checked: check.CheckedScene) -> Iterator[None]:
 
 
 def _place_object(props: mi.Properties, path: Path) -> str:
-    """Put a user's mesh into a shape; return the name of the materials that are not read."""
     kinds = {".ply": check_ply, ".obj": check_obj}
     kind = path.suffix.lower()
     if kind not in kinds:

@@ -133,7 +133,6 @@ def show(folder: Path | str) -> FolderFacts:
 
 
 def _described(folder: Path) -> tuple[Path, str, dict[str, Any]]:
-    """Return the file that describes a ``folder``, its kind, and its content."""
     if not folder.is_dir():
         raise MitsimError(f"{folder}: {'is a file' if folder.exists() else 'no such folder'}; give a folder of results")
     first = [folder / name for name in (colour_files.COLOUR, MANIFEST, RESULT_FILE) if (folder / name).is_file()]

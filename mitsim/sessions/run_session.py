@@ -297,7 +297,6 @@ class _Steps:
         return open_as(self.session.scene["scene"], self.opening, self.job, min(colours, default=NO))
 
     def _asked(self, request: Request, timing: Exposure | None, colour: str = NO) -> Generator[None, None, None]:
-        """Check a ``request``, and that its patterns fit the opened scene's projector."""
         self.opening.check(self.session.scene["scene"], request.patterns, timing, colour)
         yield
         self.bench.family(request.patterns, request.seed)
@@ -431,7 +430,6 @@ class _Steps:
 
 
 def _with_recipe(values: dict[str, Any]) -> dict[str, Any]:
-    """Return the ``values`` of a step with the recipe that its file or table describes."""
     if (own := values.get("recipe")) is not None:
         table = isinstance(own, Mapping)
         values["recipe"] = validate(SessionRecipe, dict(own), "recipe") if table else load_recipe(own)
@@ -452,14 +450,12 @@ def _checksums(place: Path) -> dict[str, str]:
 
 @lru_cache(maxsize=1 << 16)
 def _checksum(path: Path, *_: int) -> str:
-    """Return the SHA-256 of a file, computed once while its size and time of writing stay."""
     from mitsim.core.exr import checksum
 
     return checksum(path)
 
 
 def _contents(value: Any) -> Any:
-    """Return values of a step with the checksums of files in place of their whole paths."""
     if isinstance(value, Mapping):
         return {name: _contents(each) for name, each in value.items()}
     return _checksums(Path(value)) or value if isinstance(value, str) and os.path.isabs(value) else value

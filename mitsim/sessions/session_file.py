@@ -63,7 +63,6 @@ def _one_value(name: str, value: Any) -> None:
 
 
 def _recipe(recipe: Any) -> None:
-    """Refuse a ``recipe`` that is neither a file's path nor a table of a recipe."""
     if isinstance(recipe, Mapping):
         validate(SessionRecipe, dict(recipe), "recipe")
     elif not is_path(recipe):
@@ -334,7 +333,6 @@ def own_files(tables: Mapping[str, Any]) -> dict[str, Path]:
 
 
 def _change(data: dict[str, Any], name: str, value: Any, where: str) -> None:
-    """Set the field of a dotted ``name`` to a ``value``."""
     place: list[str | int] = [int(part) if part.isdecimal() else part for part in str(name).split(".")]
     if len(place) < 2 or place[0] not in TABLES:
         raise MitsimError(
@@ -683,12 +681,10 @@ class _Found:
 
 
 def _first(folder: Path) -> Path:
-    """Return the folder whose manifest describes a ``folder``: of several lines, that of the first."""
     return next(iter(open_lines(folder, *KINDS).parts.values()))
 
 
 def _made_of(folder: Path) -> dict[str, str]:
-    """Return the folders that the image in a ``folder`` is made of; none for another folder."""
     from mitsim.reconstruct.reconstruct import MADE_OF
 
     for name in (RESULT_FILE, COLOUR):
@@ -699,7 +695,6 @@ def _made_of(folder: Path) -> dict[str, str]:
 
 
 def _short_name(path: str | None, shelf: str) -> str | None:
-    """Return the name of a shipped file at a ``path`` on its ``shelf``; else the path."""
     if path is None:
         return None
     own = Path(path).parent if shelf == "scenes" else Path(path)

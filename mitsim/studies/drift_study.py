@@ -181,7 +181,6 @@ class DriftStand:
 
     @cached_property
     def _lamps(self) -> FloatArray | None:
-        """Return the light of lamps in a frame (m, m') [electrons / s]."""
         expected = self.frames.expected
         return self.frames.exposer(1.0).electrons(expected.projector_off) if expected.has_ambient else None
 
