@@ -1,3 +1,3 @@
 """The version of mitsim, for pyproject.toml, manifests and files."""
 
-__version__ = "0.16.0"
+__version__ = "0.17.0"
