@@ -649,7 +649,7 @@ class SeenFrames:
         with self._clock.stage("mend"):
             self._mended = found = known or find_mending(self.camera, self.frames)
             if found.is_better:
-                self.camera = replace(self.camera, psf=turn(self.camera.psf, found))
+                self.camera = replace(self.camera, psf=turn(self.lights.light, found))
         return found
 
     def image(self, request: ImageRequest, lam: float | Literal["auto"]) -> Reconstruction:

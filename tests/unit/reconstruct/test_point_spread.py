@@ -542,8 +542,11 @@ def called(*words: object) -> tuple[int, Any]:
     return done.return_value, json.loads(done.stdout)
 
 
-def test_an_image_in_colour_has_the_scene_s_colours_in_the_point_s_light(tmp_path: Path) -> None:
-    """(Planted: one channel's light for all; the tints left in; a lambda for each line; planes exchanged.)"""
+def test_an_image_in_colour_has_the_scene_s_colours_in_the_point_s_light(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """(Planted: one channel's light for all; the tints left in; a lambda for each line; planes exchanged; the middle
+    line mended twice.)"""
     facts, seen, light, scene = colour_pair(tmp_path)
     np.save(tmp_path / "seen.npy", seen)
     np.save(tmp_path / "psf.npy", light)
@@ -562,6 +565,11 @@ def test_an_image_in_colour_has_the_scene_s_colours_in_the_point_s_light(tmp_pat
     assert error("image") < 0.25
     grey, _ = called(*asked, tmp_path / "grey", "--psf", save(tmp_path / "grey.npy", light[..., 1]))
     assert grey == 1 and error("grey") > 0.5, "its red and blue are turned"
+    turned = save(tmp_path / "turned.npy", light[::-1, ::-1])
+    with monkeypatch.context() as patch:
+        patch.setattr(ps, "find_mending", lambda *_: Mending(reading="turned by 180 degrees", cost=0.5))
+        status, found = called(*asked, tmp_path / "mended", "--psf", turned, "--mend-psf")
+    assert status == 0 and error("mended") < 0.25, found
     page = ms.report(tmp_path / "image").read_text(encoding="utf-8")
     assert "white is the brightest pixel" in page and "electrons/s" in page
     wide = np.full((60, 62, 3), 10.0)
