@@ -64,7 +64,7 @@ class Reconstructing(ImageRequest, Pictured):
         metavar="FILE|LIST.toml",
     )
     reduce: int = option(1, "only with --psf: average blocks of K x K pixels", min=1, metavar="K")
-    mend_psf: bool = option(False, "only with --psf, under uniform light: first fit scale and rotation to the frame")
+    mend_psf: bool = option(False, "only with --psf: first fit scale, rotation and, under patterns, shift")
     chart: str | None = option(
         None,
         "only for coloured runs: colour chart in the image, to which the colours are fitted; name of a scene, or file",

@@ -31,7 +31,7 @@ from typing import Any, Literal
 
 import numpy as np
 from scipy import fft
-from scipy.ndimage import affine_transform, gaussian_filter
+from scipy.ndimage import affine_transform, gaussian_filter, maximum_filter
 from scipy.optimize import minimize
 
 from mitsim.core.arrays import FloatArray
@@ -60,6 +60,8 @@ from mitsim.reconstruct.solvers import Prior
 from mitsim.reconstruct.volume import Volume, mean_depth
 
 Operator = Callable[[FloatArray], FloatArray]
+Change = Callable[[FloatArray], Mending]
+Pair = tuple[FloatArray, FloatArray]
 
 _LEAST_SIDE = 32
 
@@ -375,12 +377,17 @@ def other_readings(psf: FloatArray) -> dict[str, FloatArray]:
 
 
 # ---- A wrong light mended --------------------------------------------------------------------------------------------
-# Scale and rotation of a wrong point spread function, fitted to the frame that it shall explain.
+# Scale, rotation and shift of a wrong point spread function, fitted to the frames that it shall explain.
 #
 # Minimised over the numbers t is J(t) = min over X >= 0 of 1/2 ||A(t) X - Y||^2 + w TV(X), in which A(t) is the camera
 # whose point spread function is turned and scaled about the middle of its picture (variable projection, Golub and
-# Pereyra, SIAM J. Numer. Anal. 10, 1973): first on a grid with a small frame, then by the simplex of Nelder and Mead. A
-# shift is unknown under uniform light, because it explains the frame as well with an image that is shifted back.
+# Pereyra, SIAM J. Numer. Anal. 10, 1973): first on a grid with a small frame, then by the simplex of Nelder and Mead.
+# Under patterns the sum of all frames is that frame, of the scene X sum_i P_i.
+#
+# **Shift.** Under uniform light a shift is unknown, because it explains the frame as well with an image that is shifted
+# back. Patterns have known places. Candidates are where images of frames, each as under uniform light, correlate with
+# their patterns; each is fitted to a few frames. Dots differ from dots a period beside them by the scene's edge alone,
+# so that the shift is used only if every other candidate costs clearly more.
 #
 # **Blur.** Interpolation of light whose lines are as thin as a pixel blurs these lines, except where pixels fall on
 # pixels, so that J depends on t by this as well: the true light cost 0.86 to 0.9 times as much as its interpolation,
@@ -399,24 +406,27 @@ _SCALES, _TURNS = np.linspace(1 - MOST_SCALE, 1 + MOST_SCALE, 7), np.linspace(-M
 _COARSE, _FINE, _SOFT = (48, 24, 0.7), (160, 60, 0.7), (160, 60, 1.4)
 """Largest shorter side [pixels] of light and frames, steps of each image, and blur [pixels]: grid and two fits."""
 _EVALUATIONS, _BLOCKS = 60, 8
+_FRAMES, _CANDIDATES, _TRIES = 2, 9, 24
+"""Patterns a side whose frames show the shift, shifts that are tried, and evaluations for each."""
 
 
 def turn(psf: FloatArray, found: Mending) -> FloatArray:
-    """Return ``psf`` (k, k') scaled and rotated as ``found``, with the same sum."""
+    """Return ``psf`` (k, k') scaled, rotated and shifted as ``found``, with the same sum."""
     down, across = TURNED.get(found.reading, (1, 1))
     angle = math.radians(found.rotation_deg)
     inverse = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]]) / found.scale
     middle = (np.array(psf.shape) - 1) / 2
-    moved = np.maximum(affine_transform(psf[::down, ::across], inverse, middle - inverse @ middle, order=3), 0.0)
+    offset = middle - inverse @ (middle + np.array(found.shift_px or (0.0, 0.0)))
+    moved = np.maximum(affine_transform(psf[::down, ::across], inverse, offset, order=3), 0.0)
     return np.asarray(moved * (psf.sum() / max(moved.sum(), 1e-300)))
 
 
 class _Cost:
-    """J of blurred frames (K, m, m') by a ``camera`` under uniform light, averaged over ``factor``^2 pixels."""
+    """J of blurred frames (K, m, m') by a ``camera``, averaged over ``factor``^2 pixels."""
 
     def __init__(self, camera: ShiftedLight, frames: Array, most: int, steps: int, blur: float) -> None:
         self.steps, (rows, columns) = steps, camera.sensor
-        self.factor = -(-min(*camera.sensor, *camera.psf.shape) // most)
+        self.factor = 1 if camera.patterns else -(-min(*camera.sensor, *camera.psf.shape) // most)
         self.blur, self.edge, self.size = blur * self.factor, math.ceil(3 * blur) * self.factor, frames.shape
         self.frames, self.noise = self.soften(frames), math.sqrt(float(np.mean([frame_noise(f) ** 2 for f in frames])))
         sensor = rows - 2 * self.edge, columns - 2 * self.edge
@@ -434,15 +444,23 @@ class _Cost:
         return turned.reduce(self.factor) if self.factor > 1 else turned
 
     def __call__(self, found: Mending) -> float:
-        return minimise(self.light(found), self.frames, self.prior, self.steps, 0.0).objective
+        return self.terms(found)[0]
 
-    def fit(
-        self, make: Callable[[FloatArray], Mending], start: FloatArray, unit: FloatArray, evaluations: int
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return the two numbers of ``make`` of least J, and their errors; ``unit`` moves light by about a pixel."""
+    def terms(self, found: Mending) -> tuple[float, float]:
+        """Return J and its first term."""
+        light = self.light(found)
+        best = minimise(light, self.frames, self.prior, self.steps, 0.0)
+        return best.objective, float(np.square(light.image_of(best.image) - self.frames).sum()) / 2
+
+    def least(self, make: Change, start: FloatArray, unit: FloatArray, evaluations: int) -> FloatArray:
+        """Return the two numbers of ``make`` of least J; ``unit`` moves light by about a pixel."""
         simplex = start + unit * np.array([[-0.5, -0.5], [1.0, 0.0], [0.0, 1.0]])
         options = {"initial_simplex": simplex, "maxfev": evaluations, "xatol": 0.01 * unit.min(), "fatol": 0.0}
-        best = minimize(lambda place: self(make(place)), start, method="Nelder-Mead", options=options).x
+        return np.asarray(minimize(lambda place: self(make(place)), start, method="Nelder-Mead", options=options).x)
+
+    def fit(self, make: Change, start: FloatArray, unit: FloatArray, evaluations: int) -> Pair:
+        """Return the two numbers of ``make`` of least J, and their errors."""
+        best = self.least(make, start, unit, evaluations)
         around = np.array(list(product((-0.5, 0.0, 0.5), repeat=2)))
         rows, columns = around.T
         terms = np.stack([np.ones(9), rows, columns, rows**2 / 2, columns**2 / 2, rows * columns], axis=1)
@@ -474,16 +492,15 @@ class _Cost:
 
 
 def find_mending(camera: ShiftedLight, frames: Array) -> Mending:
-    """Return the change by which the light of ``camera`` explains ``frames`` (1, m, m') best."""
-    if camera.psf.ndim > 2 or camera.patterns is not None:
-        raise MitsimError("only one point spread function and frames under uniform light are mended; leave this out")
+    """Return the change by which the light of ``camera`` explains ``frames`` (K K', m, m') best."""
+    if camera.psf.ndim > 2 or any(camera.count < 2 or side.min() < 0 for side in camera.patterns or ()):
+        raise MitsimError("lists, single patterns and patterns with numbers below 0 are not mended; leave this out")
     if (least := min(*camera.sensor, *camera.psf.shape)) < _LEAST_SIDE:
-        raise MitsimError(
-            f"frames and light of {least} pixels a side: at least {_LEAST_SIDE} are needed to mend a light"
-        )
+        raise MitsimError(f"frames and light of {least} pixels a side: {_LEAST_SIDE} are needed to mend a light")
     if frames.mean() <= 0:
         raise MitsimError(f"frames of mean {frames.mean():g}: no light can be mended; check exposure and black level")
-    coarse, fine = _Cost(camera, frames, *_COARSE), _Cost(camera, frames, *_FINE)
+    whole, total = replace(camera, patterns=None), frames.sum(axis=0, keepdims=True)
+    coarse, fine = _Cost(whole, total, *_COARSE), _Cost(whole, total, *_FINE)
     readings = ["", *other_readings(camera.psf)]
     grid = [Mending(scale, degrees, reading=reading) for reading, scale, degrees in product(readings, _SCALES, _TURNS)]
     start = min([*sorted(grid, key=coarse)[:5], Mending()], key=fine)
@@ -496,10 +513,50 @@ def find_mending(camera: ShiftedLight, frames: Array) -> Mending:
     # A step moves the edge of the light by one pixel.
     unit = 2 / max(camera.psf.shape) * np.array([1.0, math.degrees(1.0)])
     place, errors = fine.fit(turned, np.array([start.scale, start.rotation_deg]), unit * fine.factor, _EVALUATIONS)
-    soft = _Cost(camera, frames, *_SOFT).fit(turned, place, unit * fine.factor, 1)
-    far = float(np.max(np.abs(place - soft[0]) / np.maximum(np.hypot(errors, soft[1]), 1e-300)))
+    soft = _Cost(whole, total, *_SOFT).fit(turned, place, unit * fine.factor, 1)
     found = replace(turned(place), scale_error=float(errors[0]), rotation_error=float(errors[1]))
-    return replace(found, cost=fine(found) / fine(Mending()), apart=far if np.isfinite(soft[1]).all() else math.inf)
+    found = replace(found, cost=fine(found) / fine(Mending()), apart=_apart((place, errors), soft))
+    return found if camera.patterns is None else _shifted(camera, camera.patterns, frames, found)
+
+
+def _apart(one: Pair, other: Pair) -> float:
+    far = np.max(np.abs(one[0] - other[0]) / np.maximum(np.hypot(one[1], other[1]), 1e-300))
+    return float(far) if np.isfinite(other[1]).all() else math.inf
+
+
+def _shifted(camera: ShiftedLight, patterns: Pair, frames: Array, found: Mending) -> Mending:
+    """Return ``found`` with the shift by which the light explains ``frames`` under patterns best."""
+    (left, right), sensor, middle = patterns, camera.sensor, (np.array(camera.psf.shape) - 1) / 2
+    lit = frames.reshape(left.shape[1], right.shape[1], *sensor)[-_FRAMES:, -_FRAMES:].reshape(-1, *sensor)
+    left, right = left[:, -_FRAMES:], right[:, -_FRAMES:]
+    few = replace(camera, patterns=(left, right))
+    whole = replace(camera, psf=turn(camera.psf, found), patterns=None)
+    lights = np.array([np.outer(row, column) for row in left.T for column in right.T])
+    size = whole.scene[0] + camera.scene[0], whole.scene[1] + camera.scene[1]
+    prior, likely = Prior(ridge=1e-2 * whole.column_power, bounds=(0.0, math.inf)), np.zeros(size)
+    for frame, light in zip(lit, lights - lights.mean(axis=0), strict=True):
+        image = minimise(whole, frame[None], prior, _FINE[1], 0.0).image
+        likely += fft.ifft2(fft.fft2(image, size) * fft.fft2(light, size).conj()).real
+    peaks = np.where(maximum_filter(likely, 3, mode="wrap") == likely, likely, 0.0)
+    lags = np.stack(np.unravel_index(np.argsort(peaks, axis=None)[-_CANDIDATES:], size), axis=1)
+    starts = (lags - 2 * middle + few.origin + np.array(size) // 2) % size - np.array(size) // 2
+
+    def make(place: FloatArray) -> Mending:
+        return replace(found, shift_px=(float(place[0]), float(place[1])))
+
+    sharp, pixel = _Cost(few, lit, *_FINE), np.ones(2)
+    tried = np.array([sharp.least(make, start, pixel, _TRIES) for start in starts])
+    costs = np.array([sharp.terms(make(place)) for place in tried])
+    best = np.argmin(costs[:, 0])
+    place, errors = sharp.fit(make, tried[best], pixel, _TRIES)
+    apart = max(found.apart, _apart((place, errors), _Cost(few, lit, *_SOFT).fit(make, place, pixel, 1)))
+    # TV prefers light at the edge of the scene, beyond which it counts no step: therefore the first term decides, too.
+    others = (costs / costs[best])[(np.abs(tried - tried[best]) > 1.0).any(axis=1)]
+    # Wrong scale and rotation move light that lies off the middle.
+    off = np.array([np.average(each, weights=camera.psf) for each in np.indices(camera.psf.shape)]) - middle
+    errors = np.hypot(errors, np.hypot(found.scale_error * off, math.radians(found.rotation_error) * off[::-1]))
+    found = replace(make(place), shift_error=(float(errors[0]), float(errors[1])), apart=apart)
+    return replace(found, cost=sharp(found) / sharp(Mending()), rival=float(others.min()) if others.size else None)
 
 
 # ---- The image -------------------------------------------------------------------------------------------------------
@@ -587,7 +644,7 @@ def reconstruct_psf(
     iterations
         Largest number of steps, for ``nonnegative`` and ``tv``; None: 300.
     mend
-        Fit scale, rotation and orientation of the point spread function to the frame first, under uniform light.
+        Fit scale, rotation, orientation and, under patterns, shift of the point spread function to the frames first.
 
     Raises
     ------

@@ -41,6 +41,8 @@ _TURNED, _EQUAL = 0.85, 0.98
 """Cost ratios of the best turned copy below which it is recommended, and below which the light is wrong."""
 MOST_SCALE, MOST_TURN_DEG = 0.1, 6.0
 """Largest change of scale, and rotation [degrees], that the mending of a point spread function looks for."""
+_RIVAL = 1.02
+"""Cost ratio of a second shift below which the shift is unknown."""
 _APART = 3.0
 """Standard errors by which two fits differ at most, and those of a change that is used at least."""
 _LEAST_GAIN, _RISE, _NOISY = 1.015, 0.02, 1.2
@@ -54,7 +56,8 @@ _NEEDED, _SHARE = 1.1, 0.1
 class Mending:
     """Change of a point spread function: ``scale`` and ``rotation_deg`` (columns towards rows) about its middle.
 
-    The copy named ``reading`` is changed so.
+    The copy named ``reading`` is changed so and then moved by ``shift_px`` [rows, columns], None under uniform light.
+    ``rival`` is the cost of the second best shift over that of the best, None if no other was found.
     ``cost`` is that of the changed function over that of the given one. Errors are standard errors; fits to less and
     to more blurred frames are ``apart`` by so many of them.
     """
@@ -66,6 +69,9 @@ class Mending:
     rotation_error: float = 0.0
     cost: float = 1.0
     apart: float = 0.0
+    shift_px: tuple[float, float] | None = None
+    shift_error: tuple[float, float] | None = None
+    rival: float | None = None
 
     @property
     def is_better(self) -> bool:
@@ -74,16 +80,19 @@ class Mending:
 
     @property
     def fault(self) -> tuple[str, str]:
-        errors = self.scale_error, self.rotation_error
-        far = math.hypot((self.scale - 1) / max(errors[0], 1e-12), self.rotation_deg / max(errors[1], 1e-12))
+        numbers = self.scale - 1, self.rotation_deg, *(self.shift_px or ())
+        errors = self.scale_error, self.rotation_error, *(self.shift_error or ())
+        far = math.hypot(*(number / max(error, 1e-12) for number, error in zip(numbers, errors, strict=True)))
         if abs(self.scale - 1) >= MOST_SCALE or abs(self.rotation_deg) >= MOST_TURN_DEG:
             why = f"the best fit is at the end of the search, {MOST_SCALE:.0%} of scale or {MOST_TURN_DEG:g} degrees"
         elif (
             self.cost >= 1 or not all(map(math.isfinite, (*errors, self.apart))) or (far < _APART and not self.reading)
         ):
-            why = "no scale or rotation explains the frames better"
+            why = "no scale, rotation or shift explains the frames better"
         elif self.apart > _APART:
             why = f"fits to less and to more blurred frames are {self.apart:.1f} standard errors apart"
+        elif self.rival and self.rival < _RIVAL:
+            why = "another shift explains the frames almost as well"
         else:
             return "", ""
         return f"Not mended: {why}; the light is used as given", "use the light of one point as this camera sees it"
@@ -92,6 +101,8 @@ class Mending:
         turned = f"{self.reading}, " if self.reading else ""
         words = f"{turned}scale {self.scale:.4f} ± {self.scale_error:.4f}, "
         words += f"rotation {self.rotation_deg:.2f} ± {self.rotation_error:.2f} degrees"
+        for name, shift, error in zip(("rows", "columns"), self.shift_px or (), self.shift_error or (), strict=False):
+            words += f", {shift:+.2f} ± {error:.2f} {name}"
         return f"mended light: {words}; it costs {self.cost:.2g} times as much as the light as given"
 
 

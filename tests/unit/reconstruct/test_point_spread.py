@@ -627,7 +627,7 @@ def save(path: Path, values: np.ndarray) -> Path:
 # ---- A wrong point spread function mended ----------------------------------------------------------------------------
 
 TRUTH = Mending(1.03, 1.5)
-UNPROVEN = [("apart", 3.1), ("apart", INF), ("cost", 1.0), ("scale", 1.1), ("rotation_error", INF)]
+UNPROVEN = [("apart", 3.1), ("rival", 1.01), ("apart", INF), ("cost", 1.0), ("scale", 1.1), ("rotation_error", INF)]
 
 
 def thin_lines() -> tuple[ps.ShiftedLight, np.ndarray, np.ndarray]:
@@ -651,13 +651,13 @@ def thin_lines() -> tuple[ps.ShiftedLight, np.ndarray, np.ndarray]:
     return replace(camera, psf=given, precision=np.float32), frames.astype(np.float32), changed
 
 
-def test_a_point_right_of_the_middle_turns_downwards_and_away() -> None:
-    """(Planted: rotation the other way; no scale.)"""
+def test_a_point_right_of_the_middle_turns_downwards_and_away_and_then_is_shifted() -> None:
+    """(Planted: rotation, or shift, the other way; no scale; shift before scale.)"""
     row, column = np.indices((41, 41)) - 20
-    moved = ps.turn(np.exp(-(row**2 + (column - 10) ** 2) / 4.0), Mending(1.1, 6.0))
+    moved = ps.turn(np.exp(-(row**2 + (column - 10) ** 2) / 4.0), Mending(1.1, 6.0, shift_px=(3.0, -2.0)))
     centre = [np.average(place, weights=moved) for place in (row, column)]
     turned = np.radians(6.0)
-    assert centre == pytest.approx([11 * np.sin(turned), 11 * np.cos(turned)], abs=1e-3)
+    assert centre == pytest.approx([11 * np.sin(turned) + 3, 11 * np.cos(turned) - 2], abs=1e-3)
 
 
 def test_a_wrong_light_of_thin_lines_is_mended_within_its_errors(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -678,8 +678,28 @@ def test_a_wrong_light_of_thin_lines_is_mended_within_its_errors(monkeypatch: py
         assert abs(off) < 2.5 * error and 0 < error < most, found
     with pytest.raises(MitsimError, match="check exposure"):
         ps.find_mending(camera, 0 * frames)
-    with pytest.raises(MitsimError, match="under uniform light are mended"):
-        ps.find_mending(ps.ShiftedLight(camera.psf, (56, 56), dots(30, 30, 3)), frames)
+    with pytest.raises(MitsimError, match="patterns with numbers below 0 are not mended"):
+        ps.find_mending(ps.ShiftedLight(camera.psf, (56, 56), (-np.ones((30, 2)),) * 2), frames)
+
+
+def test_a_shift_under_dots_is_found_to_the_period_or_flagged(monkeypatch: pytest.MonkeyPatch) -> None:
+    """(Planted: no rival, candidates compared before they are fitted, patterns in another order.)"""
+    for name, value in {"_FINE": (160, 8, 0.7), "_SOFT": (160, 8, 1.4), "_CANDIDATES": 4, "_TRIES": 9}.items():
+        monkeypatch.setattr(ps, name, value)
+    rng, truth = np.random.default_rng(2), Mending(shift_px=(2.3, -1.4))
+    given = np.pad(gaussian_filter(rng.random((12, 12)) ** 8, 0.8), 6)
+    camera = ps.ShiftedLight(ps.turn(given, truth), (30, 30), dots(12, 12, 3))
+    assert camera.patterns
+    for margin, known in ((0, True), (4, False)):
+        scene = np.pad(gaussian_filter(rng.random((12 - 2 * margin,) * 2), 1.0), margin)
+        frames = camera.image_of(scene)
+        frames += 0.005 * frames.mean() * rng.normal(size=frames.shape)
+        used = replace(camera, psf=given, precision=np.float32)
+        found = ps._shifted(used, camera.patterns, frames.astype(np.float32), Mending())
+        assert found.is_better == known and found.shift_px and found.shift_error and truth.shift_px, found
+        assert known or "another shift" in found.fault[0], found
+        for each, right, error in zip(found.shift_px, truth.shift_px, found.shift_error, strict=True):
+            assert not known or abs(each - right) < 3 * error < 0.5, found
 
 
 def test_rotation_of_a_ring_has_no_finite_error() -> None:
