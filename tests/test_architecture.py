@@ -500,7 +500,7 @@ SIZES = {
     "light": (6, 1672),
     "optics": (7, 1751),
     "planner": (6, 1627),
-    "reconstruct": (19, 6064),
+    "reconstruct": (19, 6111),
     "report": (6, 1903),
     "scene": (5, 1438),
     "sensor": (4, 1105),
