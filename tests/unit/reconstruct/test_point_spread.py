@@ -661,7 +661,7 @@ def test_a_point_right_of_the_middle_turns_downwards_and_away_and_then_is_shifte
 
 
 def test_a_wrong_light_of_thin_lines_is_mended_within_its_errors(monkeypatch: pytest.MonkeyPatch) -> None:
-    """(Planted: no blur, a blur of the frame alone, no mirrored copies, a fit compared with itself.)"""
+    """(Planted: no blur, a blur of the frame alone, no mirrored copies, a fit compared with itself, stripes mended.)"""
     quick = {"_SCALES": np.array([0.97, 1.03]), "_TURNS": np.array([-2.0, 2.0]), "_EVALUATIONS": 20}
     for name, value in quick.items():
         monkeypatch.setattr(ps, name, value)
@@ -678,8 +678,9 @@ def test_a_wrong_light_of_thin_lines_is_mended_within_its_errors(monkeypatch: py
         assert abs(off) < 2.5 * error and 0 < error < most, found
     with pytest.raises(MitsimError, match="check exposure"):
         ps.find_mending(camera, 0 * frames)
-    with pytest.raises(MitsimError, match="patterns with numbers below 0 are not mended"):
-        ps.find_mending(ps.ShiftedLight(camera.psf, (56, 56), (-np.ones((30, 2)),) * 2), frames)
+    for patterns in ((-np.ones((30, 2)),) * 2, (np.ones((30, 2)), np.ones((30, 1)))):
+        with pytest.raises(MitsimError, match="stripes, single patterns and numbers below 0"):
+            ps.find_mending(ps.ShiftedLight(camera.psf, (56, 56), patterns), frames)
 
 
 def test_a_shift_under_dots_is_found_to_the_period_or_flagged(monkeypatch: pytest.MonkeyPatch) -> None:
