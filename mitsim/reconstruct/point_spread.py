@@ -494,7 +494,7 @@ class _Cost:
 def find_mending(camera: ShiftedLight, frames: Array) -> Mending:
     """Return the change by which the light of ``camera`` explains ``frames`` (K K', m, m') best."""
     if camera.psf.ndim > 2 or any(side.shape[1] < 2 or side.min() < 0 for side in camera.patterns or ()):
-        raise MitsimError("lists, stripes, single patterns and numbers below 0 in patterns are not mended; leave this out")
+        raise MitsimError("lists, stripes, single patterns and numbers below 0 in patterns are not mended; omit this")
     if (least := min(*camera.sensor, *camera.psf.shape)) < _LEAST_SIDE:
         raise MitsimError(f"frames and light of {least} pixels a side: {_LEAST_SIDE} are needed to mend a light")
     if frames.mean() <= 0:
