@@ -248,7 +248,7 @@ class ShiftedLight:
 
     @cached_property
     def _blend(self) -> Array:
-        """Weights (D, n, n') of the lights at each place of the scene."""
+        """Return the weights (D, n, n') of the lights at each place of the scene."""
         assert self.places is not None
         sides = zip(self._plane, self.origin, self.psf.shape[-2:], self.sensor, strict=True)
         rows, columns = (np.arange(n) - origin + (k - m) / 2 for n, origin, k, m in sides)
